@@ -18,7 +18,6 @@ from wepose_pin.body.table_file import format_table
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
 from wepose_pin.readers.describe import describe_file
-from wepose_pin.readers.propose import Wearer
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report.track import render_track_report
 from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
@@ -29,7 +28,7 @@ from wepose_pin.writers.export import export
 from wepose_pin.writers.motion import Motion, find_measured_points
 from wepose_pin.writers.opensim import write_mot
 from wepose_pin.writers.result import read_result, write_result
-from wepose_pin.writers.tables import build_table
+from wepose_pin.writers.export import build_table
 
 THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
 SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")
@@ -220,7 +219,7 @@ def test_info_proposes_its_segments(body: BodyModel, tmp_path: Path) -> None:
     ]
     rows = np.column_stack([time, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(time), 2))])
     np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=",".join(["time", *names]), comments="")
-    session = describe_file(tmp_path / "d.csv", wearer=Wearer(body.table, Path("whole_body"))).session
+    session = describe_file(tmp_path / "d.csv", body=body.table, model=Path("whole_body")).session
     assert session is not None
     assert 'model = "whole_body"' in session
     assert "[sensors.left_thigh]   # usually outside, above the knee" in session

@@ -76,7 +76,6 @@ def angles(
     from ..report import angles as report
     from ..report.page import write_pages
     from ..writers.provenance import collect_provenance, write_provenance
-    from ..writers.tables import write_table_csv
 
     check_selection(interval, phase)
     finds = f"--main-angle {main_angle}" if main_angle is not None else "--cycles" if cycles else ""
@@ -99,7 +98,8 @@ def angles(
             }
             for name, table in tables.items():
                 if len(table):
-                    write_table_csv(folder / f"{name}.csv", table.with_columns(selectors.float().round(DECIMALS)))
+                    rounded = table.with_columns(selectors.float().round(DECIMALS))
+                    rounded.fill_nan(None).write_csv(folder / f"{name}.csv")
             figures = report.draw_figures(movements)
             for name, figure in figures.items():
                 (folder / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")

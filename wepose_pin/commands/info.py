@@ -42,17 +42,16 @@ def info(
     from ..body import load_model
     from ..documents import check_file, whole_file
     from ..readers.describe import describe_file, find_file
-    from ..readers.propose import Wearer
 
     with progress_bar() as progress:
         progress("reading", 0.0)
-        wearer = Wearer(load_model(model).table, Path(model)) if model is not None else None
-        file = find_file(file, wearer)
+        body = None if model is None else load_model(model).table
+        file = find_file(file, body)
         session = out or file.absolute().parent / "session.toml"
         writes = write or out is not None
         if writes:
             check_file(session, force)
-        description = describe_file(file, session.absolute().parent, wearer)
+        description = describe_file(file, session.absolute().parent, body, None if model is None else Path(model))
         if writes:
             if description.session is None:
                 raise BadOption(f"--write: there is no session to write for {description.what}")

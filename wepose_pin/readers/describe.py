@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..body import load_table
+from ..body import BodyTable, load_table
 from ..data_tables import FORMATS as TABLES
 from ..data_tables import read_names
 from ..diagnostics import Diagnostic
@@ -19,16 +19,7 @@ from ..recording import ImuSensor, Recording, format_span, format_time
 from ..recording.gaps import find_runs
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
-from .guess import guess_arrays, guess_columns
-from .propose import (
-    Proposal,
-    Wearer,
-    advise,
-    find_static_intervals,
-    format_session,
-    propose_from_device,
-    propose_from_names,
-)
+from .propose import Proposal, find_static_intervals, format_session, propose_from_device, propose_from_names
 from .reference import read_reference
 from .registry import detect_format
 from .session import read_session
@@ -45,7 +36,7 @@ class Description(NamedTuple):
     diagnostics: tuple[Diagnostic, ...] = ()
 
 
-def find_file(path: Path, wearer: Wearer | None = None) -> Path:
+def find_file(path: Path, body: BodyTable | None = None) -> Path:
     """Find what is described of a path: the session or subject in a folder, or the first recording in it.
 
     A file, a result, and a folder that is one recording are returned as they are.
@@ -64,17 +55,20 @@ def find_file(path: Path, wearer: Wearer | None = None) -> Path:
     data = [file for file in files if file.suffix.lower() in TABLES or is_array_file(file) or detect_format(file)]
     if not data:
         raise MissingFile(f"{path}: a folder without session.toml, and without a recording in it; name a file")
-    table = (wearer or Wearer(load_table())).table
-    return next((file for file in data if table.guess_segment(file.stem)), data[0])
+    body = body or load_table()
+    return next((file for file in data if body.guess_segment(file.stem)), data[0])
 
 
-def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None = None) -> Description:
+def describe_file(
+    path: Path, folder: Path | None = None, body: BodyTable | None = None, model: Path | None = None
+) -> Description:
     """Describe a file or folder, as `find_file` returns it.
 
     Parameters
     ----------
     folder : for which a session is proposed; None: that of the file
-    wearer : of the sensors; None: the upper body
+    body : that carries the sensors; None: the upper body
+    model : its file, or its name in the package, as the session is to name it
 
     Raises
     ------
@@ -83,43 +77,52 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
     """
     if not path.exists():
         raise MissingFile(f"{path}: no such file or folder")
+    suffix = path.suffix.lower()
     if path.is_dir() and (path / "pose.parquet").is_file():
         return Description(f"{path}: a result of `wepose track`", (f"look at it: wepose view {path}",))
-    if path.suffix.lower() == ".toml":
+    if suffix == ".toml":
         return _describe_toml(path)
-    if path.suffix.lower() in (".c3d", ".trc"):
+    if suffix in (".c3d", ".trc"):
         return _describe_reference(path)
-    folder, wearer = folder or path.absolute().parent, wearer or Wearer(load_table())
-    table = wearer.table
+    folder, body = folder or path.absolute().parent, body or load_table()
     if format := detect_format(path):
-        return _describe_data(path, folder, propose_from_device(path, folder, format, table), wearer)
+        return _describe_data(propose_from_device(path, folder, format, body), model)
     if is_array_file(path):
-        arrays = ArrayFile(path)
-        guess = guess_arrays(arrays.shapes, table)
-        proposal = propose_from_names(path, folder, guess, list(arrays.shapes), arrays, table)
-        return _describe_data(path, folder, proposal, wearer)
-    names, units = read_names(path) if path.suffix.lower() in TABLES else ([], {})
-    if len(names) > (path.suffix.lower() == ".txt"):  # a text that is no table has one column
-        if any(f"{point}_x" in names for point in table.points):
-            return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns")
-        guess = guess_columns(names, table, units)
-        return _describe_data(path, folder, propose_from_names(path, folder, guess, names, None, table), wearer)
-    raise BadData(f"{path}: is nothing that is known here; docs/formats.md lists the files that are read")
+        return _describe_data(propose_from_names(path, folder, body, ArrayFile(path)), model)
+    names = read_names(path)[0] if suffix in TABLES else []
+    if len(names) <= (suffix == ".txt"):  # a text that is no table has one column
+        raise BadData(f"{path}: is nothing that is known here; docs/formats.md lists the files that are read")
+    if any(f"{point}_x" in names for point in body.points):
+        return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns")
+    return _describe_data(propose_from_names(path, folder, body, None), model)
 
 
-def _describe_data(path: Path, folder: Path, proposal: Proposal, wearer: Wearer) -> Description:
+def _describe_data(proposal: Proposal, model: Path | None) -> Description:
     """Describe data by what a proposed session reads, with this session."""
-    recording = proposal.read(folder / "session.toml", path.name) if proposal.sensors else None
-    what, diagnostics = f"{path}: {proposal.title}", tuple(proposal.diagnostics)
+    recording = proposal.read() if proposal.sensors else None
+    about = Description(f"{proposal.path}: {proposal.title}", tuple(proposal.facts))
+    about = about._replace(diagnostics=tuple(proposal.diagnostics))
     if not proposal.sensors:
-        return Description(what, tuple(proposal.facts), diagnostics=diagnostics)
-    session = format_session(proposal, path, folder, wearer, recording)
+        return about
+    about = about._replace(session=format_session(proposal, model, recording), then="mend what cannot be read")
     if recording is None:
-        return Description(what, tuple(proposal.facts), (), session, "mend what cannot be read", diagnostics)
+        return about
     # A sensor on an unknown segment has its name in the file.
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
-    facts, rows = (*proposal.facts, *_list_facts(recording)), _list_sensors(recording, proposal.labels)
-    return Description(what, facts, rows, session, advise(recording, wearer.table), (*diagnostics, *read))
+    then = (
+        "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject; "
+        "or state the mounts and wepose track SESSION -o result"
+    )
+    if all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in recording.sensors.values()):
+        then = "wepose track SESSION -o result"
+    if not set(recording.sensors) <= set(proposal.body.segments):
+        then = f"take the # off the lines of each sensor with ? and write its segment in place of SEGMENT; then {then}"
+    return about._replace(
+        facts=(*about.facts, *_list_facts(recording)),
+        sensors=_list_sensors(recording, proposal.labels),
+        then=then,
+        diagnostics=(*about.diagnostics, *read),
+    )
 
 
 def _describe_reference(path: Path) -> Description:
@@ -148,12 +151,8 @@ def _describe_toml(path: Path) -> Description:
     raise BadData(f"{path}: TOML, but neither a session ([data], [sensors.…]) nor a subject ([lengths])")
 
 
-# Contents of a recording -------------------------------------------------------------------------------------------
-
-
 def _list_facts(recording: Recording) -> tuple[str, ...]:
-    first, last = float(recording.time[0]), float(recording.time[-1])
-    facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {format_span((first, last))}"]
+    facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {format_span(recording.time[[0, -1]])}"]
     static = find_static_intervals(recording)
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in static[:8]) + (" …" if len(static) > 8 else "")
     facts.append(f"all sensors static [s]: {listed}" if static else "all sensors are never static for a second")

@@ -1,52 +1,30 @@
-"""Guesses from the column names of an unknown table: a proposal that the user checks, never applied by itself."""
+"""Guesses from the column names of an unknown table: a proposal that the user checks, never applied by itself.
+
+``guess.toml`` has the words.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from ..body import BodyTable, load_table
+from ..documents import read_toml
 
-# The place of the axis in a name without it.
-HOLE = "\0"
-# Signals in the order of the search; a lone letter stands right before the axis, as in gx, ax.
-_ALONE = rf"(?=[^a-z]*({HOLE}|$))"
-SIGNALS = (
-    ("gyro", rf"gyr|ang(ular)?[ _]?vel|omega|rot(ation)?[ _]?rate|winkelgeschw|drehrate|(^|[^a-z])[gw]{_ALONE}"),
-    ("accel", rf"acc|beschl|specific[ _]?force|(^|[^a-z])a{_ALONE}"),
-    ("orientation", rf"quat|ori(entation)?|rotation|attitude|(^|[^a-z])q{_ALONE}"),
-)
+HOLE = "\0"  # the place of the axis in a name without it
+_WORDS = read_toml(Path(__file__).with_suffix(".toml"), "words")
+SIGNALS = {name: text.replace("{alone}", rf"(?=[^a-z]*({HOLE}|$))") for name, text in _WORDS["signals"].items()}
+UNITS: Mapping[str, Mapping[str, str]] = _WORDS["units"]
+TIME, BESIDE_TIME = set(_WORDS["time"]["names"]), set(_WORDS["time"]["beside"])
+TIME_UNIT = {word: unit for unit, words in _WORDS["time"]["units"].items() for word in words}
 NOT = r"mag|free|linear|lin[ _]?acc|user|earth|std|cov"  # no raw data, whatever else the name says
+ORDER = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 _BEFORE_AXIS = re.compile(r"(acc|accel|gyr|gyro|omega|vel|rate|quat|(^|[^a-z])[agwq])$")
 _NUMBERED = re.compile(r"(.*?)[ _.\-\[(]*([0-3])[\])]?\s*")
 _BRACKETS = re.compile(r"(.*?)\s*[\[({]\s*([^\[\]{}]*?)\s*[\])}]\s*")
-# Units as they are written → as a session states them.
-UNITS = {
-    "gyro": {
-        "rad/s": r"rad ?[/_p] ?s(ec)?|rads|rps|rad s-1",
-        "deg/s": r"(deg(rees)?|°|º) ?[/_p] ?s(ec(onds?)?)?|degrees per second|degs|dps|°s",
-    },
-    "accel": {
-        "m/s^2": r"m ?[/_p] ?\(?s(\^?2|²|\*\*2|/s)?\)?(\^2|²)?|m/s\*s|ms-2|m s-2|m\.s-2",
-        "g": r"g'?s?|g-?force|units of g",
-        "mg": r"mg|milli ?-?g",
-    },
-}
-# Words of a name that make it a column of times, units of it, and words that may stand beside them.
-TIME = {
-    *("time", "times", "timestamp", "timestamps", "t", "ts", "clock", "elapsed", "epoch", "datetime", "date"),
-    *("zeit", "zeitstempel", "uhrzeit", "datum"),
-}
-TIME_UNIT = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "milli", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "micro", "micros", "microsec", "microsecond", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nano", "nanos", "nanosec", "nanosecond", "nanoseconds"), "ns"),
-}
-BESIDE_TIME = {"stamp", "unix", "utc", "since", "start", "sync", "system", "host", "device", "sensor", "shimmer", "cal"}
-ORDER = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 
 
 class Guess(NamedTuple):
@@ -72,6 +50,41 @@ def guess_columns(
     return _make_guess(names, group_columns(names, table), own_units)
 
 
+def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None = None) -> Guess:
+    """Guess signals from the paths of arrays (n, 3) and (n, 4); `table` as for `guess_columns`."""
+    by_sensor: dict[str, dict[str, list[str]]] = {}
+    for path, shape in shapes.items():
+        signal = guess_signal(path)
+        if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
+            by_sensor.setdefault(_find_owner(path, table or load_table()), {}).setdefault(signal, [path])
+    vectors = (path for path, shape in shapes.items() if max(shape, default=0) == math.prod(shape))
+    times = {path.rpartition("/")[2]: path for path in vectors}
+    guess = _make_guess(list(times), by_sensor, {})
+    units = {times.get(name, name): unit for name, unit in guess.units.items()}
+    return guess._replace(times=[times[name] for name in guess.times], units=units)
+
+
+def _make_guess(
+    names: Sequence[str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
+) -> Guess:
+    sensors: dict[str, Mapping[str, list[str]]] = {}
+    for name, signals in by_sensor.items():
+        needed = ("gyro", "accel") if {"gyro", "accel"} <= set(signals) else ("orientation",)
+        if set(needed) <= set(signals):
+            sensors[name] = {signal: signals[signal] for signal in signals if signal in needed}
+    times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
+    units = {}
+    for name in times:
+        words = [own_units.get(name, "").lower(), *_split_words(name)]
+        if unit := next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None):
+            units[name] = unit
+    for signals in sensors.values():
+        for signal, columns in signals.items():
+            if unit := guess_unit(signal, own_units.get(columns[0], "")):
+                units[signal] = unit
+    return Guess(times, sensors, units)
+
+
 def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[str, dict[str, list[str]]]:
     """Group columns: segment, or ?name where it is not known → signal → the columns of its axes; `table` as above."""
     table = table or load_table()
@@ -90,7 +103,7 @@ def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[
         order = ORDER[signal]
         if set("0123") <= set(axes) and signal == "orientation":
             order = "1230"  # numbered quaternions begin with w
-        elif not set(order) <= set(axes) and set("012") <= set(axes) and signal != "orientation":
+        elif not set(order) <= set(axes) and signal != "orientation":
             order = "012"
         if set(order) <= set(axes):
             by_sensor.setdefault(_find_owner(stem, table), {}).setdefault(signal, [axes[axis] for axis in order])
@@ -102,11 +115,9 @@ def split_unit(name: str) -> tuple[str, str]:
     match = _BRACKETS.fullmatch(name)
     if match and match[1] and not re.fullmatch("[xyzw0-3]", match[2], re.IGNORECASE):
         return match[1], match[2]
-    for patterns in UNITS.values():
-        for pattern in patterns.values():
-            match = re.fullmatch(rf"(.*[xyz].*)[ _,]+({pattern})", name, re.IGNORECASE)
-            if match:
-                return match[1], match[2]
+    for pattern in (pattern for patterns in UNITS.values() for pattern in patterns.values()):
+        if match := re.fullmatch(rf"(.*[xyz].*)[ _,]+({pattern})", name, re.IGNORECASE):
+            return match[1], match[2]
     return name, ""
 
 
@@ -132,27 +143,12 @@ def guess_unit(signal: str, text: str) -> str | None:
     return next(matches, None)
 
 
-def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None = None) -> Guess:
-    """Guess signals from the paths of arrays (n, 3) and (n, 4); `table` as for `guess_columns`."""
-    by_sensor: dict[str, dict[str, list[str]]] = {}
-    for path, shape in shapes.items():
-        signal = guess_signal(path)
-        if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
-            by_sensor.setdefault(_find_owner(path, table or load_table()), {}).setdefault(signal, [path])
-    times = {
-        path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == math.prod(shape)
-    }
-    guess = _make_guess(list(times), by_sensor, {})
-    units = {times.get(name, name): unit for name, unit in guess.units.items()}
-    return guess._replace(times=[times[name] for name in guess.times], units=units)
-
-
 def guess_signal(stem: str) -> str | None:
     """Guess the signal from a column's name without its axis."""
     text = stem.lower()
     if re.search(NOT, text):
         return None
-    return next((signal for signal, pattern in SIGNALS if re.search(pattern, text)), None)
+    return next((signal for signal, pattern in SIGNALS.items() if re.search(pattern, text)), None)
 
 
 def _is_time(name: str) -> bool:
@@ -168,31 +164,9 @@ def _split_words(name: str) -> list[str]:
 
 def _find_owner(stem: str, table: BodyTable) -> str:
     """Return the segment, or the name without its signal, which one sensor's signals have in common."""
-    segment = table.guess_segment(stem.replace(HOLE, " "))
-    if segment:
+    if segment := table.guess_segment(stem.replace(HOLE, " ")):
         return segment
     text = stem.lower()
-    for _, pattern in SIGNALS:
+    for pattern in SIGNALS.values():
         text = re.sub(f"({pattern})[a-z]*", "", text)
     return f"?{re.sub(f'[ _./:{HOLE}-]+', ' ', text).strip()}"
-
-
-def _make_guess(
-    names: Sequence[str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
-) -> Guess:
-    sensors: dict[str, Mapping[str, list[str]]] = {}
-    for name, signals in by_sensor.items():
-        needed = ("gyro", "accel") if {"gyro", "accel"} <= set(signals) else ("orientation",)
-        if set(needed) <= set(signals):
-            sensors[name] = {signal: signals[signal] for signal in signals if signal in needed}
-    times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
-    units = {}
-    for name in times:
-        words = [own_units.get(name, "").lower(), *_split_words(name)]
-        if unit := next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None):
-            units[name] = unit
-    for signals in sensors.values():
-        for signal, columns in signals.items():
-            if unit := guess_unit(signal, own_units.get(columns[0], "")):
-                units[signal] = unit
-    return Guess(times, sensors, units)

@@ -9,9 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import polars as pl
+
+from ..angles import angle_table, diagnose_lock, joint_angles
 from ..arguments import check_arguments
 from ..assets import find_plugins, load_plugin
-from ..body.kinematics import find_samples
+from ..body.kinematics import build_pose_table, find_samples
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file
 from ..errors import BadData, BadOption, one_of
@@ -33,10 +36,9 @@ from .lerobot import write_lerobot
 from .motion import Motion, check_rate, resample
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import provenance_text, write_provenance
-from .result import SUBJECT_URDF, format_urdf, read_result
+from .result import SUBJECT_URDF, format_urdf, read_result, write_table
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
-from .tables import write_csv, write_parquet
 
 Result = TrackResult | HasJointMotion | str | Path
 # What a format is of: a person's motion; joints of a person or a robot; motions of robots; a body without a motion.
@@ -51,8 +53,7 @@ class Format(NamedTuple):
     ----------
     of : what it holds: `PERSON`, `JOINTS`, `ROBOTS` or `BODY`
     write : path, motion and own options → what the file cannot hold, or None. A format of `ROBOTS` gets all motions,
-        one of `BODY` the result. It raises `BadData` where these lack what the file needs, `BadOption` where a package
-        is not installed
+        one of `BODY` the result
     options : that it has of those of `export`
     suffix : of the file; None: the name of the format. Empty: a folder
     earlier : patterns of the files of an earlier run in the folder, which `force` replaces
@@ -72,16 +73,33 @@ def write_urdf(file: Path, result: Result) -> None:
     elif isinstance(result, HasJointMotion):
         file.write_text(result.joint_motion().urdf, encoding="utf-8")
     else:
-        urdf = Path(str(result)) / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
+        urdf = Path(result) / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
         check_file(urdf, "a folder that `wepose track` or `wepose retarget` wrote")
         shutil.copyfile(urdf, file)
 
 
-def _is_of_robot(result: Result) -> bool:
-    """Return whether a result is a robot's trajectory, and not a person's motion."""
-    if isinstance(result, str | Path):
-        return (Path(result) / TRAJECTORY).is_file()
-    return not isinstance(result, TrackResult)
+def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
+    """Write every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
+    rows, diagnostics = build_table(motion)
+    rows.fill_nan(None).write_csv(path)
+    return diagnostics
+
+
+def write_parquet(path: Path, motion: Motion) -> list[Diagnostic]:
+    """Write every number to its last bit; what is not known is NaN."""
+    rows, diagnostics = build_table(motion)
+    write_table(path, rows)
+    return diagnostics
+
+
+def build_table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
+    """Build the table of the pose, and beside it that of the angles where a joint has both of its segments."""
+    pose = build_pose_table(motion.pose).with_columns(**motion.pose.joints)
+    try:
+        angles = joint_angles(motion.pose)
+    except BadData:
+        return pose, []
+    return pl.concat([pose, angle_table(angles).drop("time")], how="horizontal"), diagnose_lock(angles)
 
 
 # pyproject.toml registers them as those of other distributions.
@@ -201,13 +219,14 @@ def export(
     results = [result] if isinstance(result, Result) else list(result)
     file = Path(file)
     name = _choose_format(file, format)
-    kind = list_formats()[name]
+    formats = list_formats()
+    kind = formats[name]
     stated: dict[str, Any] = {"names": names, "rate_hz": rate_hz, "interval": interval, "phase": phase}
     stated |= {"episodes": episodes, "instruction": instruction, "osim_model": osim_model}
     own = {option: value for option, value in stated.items() if value is not None}
     for option, value in own.items():
         if option not in kind.options:
-            having = " and ".join(each for each, other in list_formats().items() if option in other.options)
+            having = " and ".join(each for each, other in formats.items() if option in other.options)
             reason = "there is no motion in it" if option in MOTION else f"only of format {having}"
             raise BadOption(f"--{option.replace('_', '-')} {value}: not of format {name}; {reason}")
     if rate_hz is not None:
@@ -218,36 +237,38 @@ def export(
     with contextlib.ExitStack() as files:
         if kind.earlier:
             partial = files.enter_context(data_folder(file, force, kind.earlier))
+            if provenance is not None:
+                write_provenance(partial, provenance)
         else:
             partial = files.enter_context(whole_file(file, force))
-        if provenance is not None and kind.earlier:
-            write_provenance(partial, provenance)
-        elif provenance is not None:
-            beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
-            beside.write_text(provenance_text(provenance), encoding="utf-8")
+            if provenance is not None:
+                beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
+                beside.write_text(provenance_text(provenance), encoding="utf-8")
         if kind.of == BODY:
             return Exported(name, kind.write(partial, results[0]) or [])
-        motions = [_read_motion(each, name, kind.of, interval, phase, rate_hz) for each in results]
+        motions = [_read_motion(each, name, interval, phase, rate_hz) for each in results]
         if kind.of == ROBOTS:
             return Exported(name, kind.write(partial, motions, **own) or [])
         if name == "sto" and own:
-            setups = {path: files.enter_context(whole_file(path, force)) for path in list_setups(file)}
+            setups = [files.enter_context(whole_file(path, force)) for path in list_setups(file)]
             write_setups(file, setups, motions[0], str(own.pop("osim_model")))
         return Exported(name, kind.write(partial, motions[0], **own) or [])
 
 
+def _is_of_robot(result: Result) -> bool:
+    if isinstance(result, str | Path):
+        return (Path(result) / TRAJECTORY).is_file()
+    return not isinstance(result, TrackResult)
+
+
 def _read_motion(
-    result: Result,
-    format: str,
-    of: str,
-    interval: tuple[float, float] | None,
-    phase: str | None,
-    rate_hz: float | None,
+    result: Result, format: str, interval: tuple[float, float] | None, phase: str | None, rate_hz: float | None
 ) -> Any:
-    """Read the selected part of a motion, of at least two samples: a `Motion` where `of` is `PERSON`, or `JointMotion`.
+    """Read the selected part of a motion, of at least two samples: a `Motion` for formats of a person, or `JointMotion`.
 
     It is resampled where a rate is given.
     """
+    of = list_formats()[format].of
     if _is_of_robot(result):
         if of == PERSON:
             others = ", ".join(each for each, other in list_formats().items() if other.of != PERSON)
@@ -278,10 +299,9 @@ def _read_motion(
 def _choose_format(file: Path, name: str | None) -> str:
     """Choose the format that is stated, or that of the file's suffix."""
     formats, suffix = list_formats(), file.suffix.lower()
-    if name is None:
-        name = suffix.removeprefix(".")
-        if name not in formats:
-            raise BadOption(f"-o {file}: '{suffix}' is no format's suffix; state it by --format; {one_of(formats)}")
+    if name is None and suffix.removeprefix(".") not in formats:
+        raise BadOption(f"-o {file}: '{suffix}' is no format's suffix; state it by --format; {one_of(formats)}")
+    name = name or suffix.removeprefix(".")
     if name not in formats:
         raise BadOption(f"--format {name}: not known; {one_of(formats, name)}")
     needed = f".{name}" if formats[name].suffix is None else formats[name].suffix

@@ -3,14 +3,14 @@
 In OpenSim's ground G (x forward, y up, z right), the angles and the bodies those of Rajagopal's model (`rajagopal`).
 
 Sources: opensim-core, OpenSim/Common: DelimFileAdapter.h (.mot, .sto: ``endheader`` alone in a line, tabs, no empty
-line), Storage.cpp (.mot: the name first, ``nRows`` and ``nColumns``), TRCFileAdapter.cpp (.trc: the eight keys of
-`_TRC_KEYS`, a tab ends each row, a marker with an empty cell is missing).
+line), Storage.cpp (.mot: the name first, ``nRows`` and ``nColumns``), TRCFileAdapter.cpp (.trc: eight keys, a tab ends
+each row, a marker with an empty cell is missing).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -23,12 +23,8 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
 from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
-from .rajagopal import SPANS, coordinates, in_ground, orientations
+from .rajagopal import LENGTHS, coordinates, in_ground, orientations
 
-_TRC_KEYS = (
-    *("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"),
-    *("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"),
-)
 GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
 # [rad] rms by which the model may miss a body. Its elbow turns about an axis that is 13 deg oblique: arms of simulated
 # people, whose orientations are exact, are missed by 3 to 7 deg, of a real recording by up to 9.
@@ -36,7 +32,7 @@ MOST_MISSED = np.deg2rad(12.0)
 
 
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
-    """Joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
+    """Write joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
     Beside the three angles of a joint ``<joint>_near_lock`` is 1 where the first and the third are not to be read. Of a
     mechanism it has the joints of its URDF by their names, in degrees, and in m those that slide.
@@ -46,152 +42,53 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
     names : only these: "isb" or "opensim"
     """
     check_complete(motion, "a .mot")
-    diagnostics = diagnose_gaps(motion)
+    diagnostics, angles, others = diagnose_gaps(motion), dict[str, np.ndarray](), dict[str, np.ndarray]()
     if motion.pose.joints:
         if names is not None:
             raise BadOption(f"--names {names}: {motion.where} is of a mechanism, whose joints have their own names")
         slides = {joint.name for joint in motion.model.robot.joints if joint.type == "prismatic"}
-        joints = {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
-        _write_coordinates(path, motion, joints)
-        return diagnostics
-    columns, marks = dict[str, np.ndarray](), dict[str, np.ndarray]()
-    if names != "opensim":
-        angles = joint_angles(motion.pose)
-        diagnostics += diagnose_lock(angles)
-        for name, joint in angles.joints.items():
-            columns |= {f"{name}_{angle}": joint[angle] for angle in joint}
-            marks[f"{name}_near_lock"] = joint.near_lock.astype(int)
-    if names != "isb":
-        turned, residuals = coordinates(orientations(motion.pose.quat_WL))
-        columns |= turned
-        diagnostics += [
-            Diagnostic("orientation-residual", WARNING, body, float(angle), MOST_MISSED, {"variant": "opensim"})
-            for body, angle in residuals.items()
-            if angle > MOST_MISSED
-        ]
-    if not columns:
-        raise BadData(
-            f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles to write"
-        )
-    _write_coordinates(path, motion, {name: np.degrees(angle) for name, angle in columns.items()} | marks)
-    return diagnostics
-
-
-def _write_coordinates(path: Path, motion: Motion, columns: Mapping[str, np.ndarray]) -> None:
-    rows = pl.DataFrame({"time": motion.pose.time, **columns})
-    header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
+        others = {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
+    else:
+        if names != "opensim":
+            isb = joint_angles(motion.pose)
+            diagnostics += diagnose_lock(isb)
+            for name, joint in isb.joints.items():
+                angles |= {f"{name}_{angle}": joint[angle] for angle in joint}
+                others[f"{name}_near_lock"] = joint.near_lock.astype(int)
+        if names != "isb":
+            opensim, residuals = coordinates(orientations(motion.pose.quat_WL))
+            angles |= opensim
+            diagnostics += [
+                Diagnostic("orientation-residual", WARNING, body, angle, MOST_MISSED, {"variant": "opensim"})
+                for body, angle in residuals.items()
+                if angle > MOST_MISSED
+            ]
+        if not angles:
+            raise BadData(f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles")
+    rows = pl.DataFrame({"time": motion.pose.time, **{k: np.degrees(v) for k, v in angles.items()}, **others})
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
-    _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
+    header = [name, "version=1", f"nRows={rows.height}", f"nColumns={rows.width}", "inDegrees=yes", "endheader"]
+    _write_rows(path, header, rows)
+    return diagnostics
 
 
 # Orientations -----------------------------------------------------------------------------------------------------
 
 
 def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``."""
+    """Write orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``."""
     check_complete(motion, "a .sto")
-    _write_quaternions(path, motion, motion.pose.time, _bodies(motion))
+    _write_quaternions(path, motion, motion.pose.time, _find_bodies(motion))
     return diagnose_gaps(motion)
 
 
-def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
-    """One sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
+def write_placement(path: Path, motion: Motion) -> None:
+    """Write one sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
     upright = np.array([[0.0, 0.0, 0.0, 1.0]])
-    _write_quaternions(path, motion, np.zeros(1), dict.fromkeys(_bodies(motion), upright))
-    return []
+    _write_quaternions(path, motion, np.zeros(1), dict.fromkeys(_find_bodies(motion), upright))
 
 
-def list_setups(sto: Path) -> list[Path]:
-    """List what OpenSense needs beside a .sto: the placement, and the set-ups of IMU Placer and IK."""
-    return [sto.with_name(f"{sto.stem}{ending}") for ending in ("_placement.sto", "_placer.xml", "_ik.xml")]
-
-
-def write_setups(sto: Path, written: Mapping[Path, Path], motion: Motion, model: str) -> None:
-    """Write what OpenSense needs beside the .sto of a motion: each of `list_setups` where `written` has it.
-
-    `model` is the name of the subject's model.
-    """
-    placement, placer, ik = list_setups(sto)
-    placed_model = f"{sto.stem}_placed.osim"  # with sensors, which the IMU Placer writes
-    write_placement(written[placement], motion)
-    placer_keys = {
-        "model_file": model,
-        "sensor_to_opensim_rotations": "0 0 0",
-        "orientation_file_for_calibration": placement.name,
-        "output_model_file": placed_model,
-    }
-    _write_setup(written[placer], "IMUPlacer", placer_keys)
-    step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
-    ik_keys = {
-        "model_file": placed_model,
-        "orientations_file": sto.name,
-        "sensor_to_opensim_rotations": "0 0 0",
-        "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
-        "report_errors": "true",
-        "results_directory": ".",
-        "output_motion_file": f"{sto.stem}_ik.mot",
-    }
-    _write_setup(written[ik], "IMUInverseKinematicsTool", ik_keys)
-
-
-def _write_setup(path: Path, tool: str, properties: Mapping[str, Any], name: str = "") -> None:
-    document = Element("OpenSimDocument", Version="40000")
-    _add_properties(SubElement(document, tool, name=name or tool), properties)
-    indent(document, "\t")
-    path.write_bytes(tostring(document, encoding="UTF-8", xml_declaration=True) + b"\n")
-
-
-def _add_properties(parent: Element, properties: Mapping[str, Any]) -> None:
-    """Add properties and what is nested in them; of a list of mappings each is an object of the same name."""
-    for name, value in properties.items():
-        for each in value if isinstance(value, list) else [value]:
-            child = SubElement(parent, name)
-            if isinstance(each, Mapping):
-                _add_properties(child, each)
-            else:
-                child.text = each
-
-
-# The model --------------------------------------------------------------------------------------------------------
-
-
-def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MODEL) -> list[Diagnostic]:
-    """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths; with the factors.
-
-    The factors are over the lengths of Rajagopal's model. Masses stay. No markers are placed, so
-    the tool's part for them is left out.
-
-    Parameters
-    ----------
-    osim_model : name of the generic model
-    """
-    factors: dict[str, dict[str, float]] = {}
-    for length, span in SPANS.items():
-        if length not in motion.model.lengths:
-            continue
-        factor = motion.model.lengths[length] / span.generic
-        for body in span.bodies:
-            factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(dict.fromkeys(span.axes, factor))
-    if not factors:
-        raise BadData(f"{motion.where}: the body has no length that OpenSim's model of a person has")
-    scales = [
-        {"scales": " ".join(f"{value:.9f}" for value in of.values()), "segment": body, "apply": "true"}
-        for body, of in factors.items()
-    ]
-    scaler = {
-        "apply": "true",
-        "scaling_order": "manualScale",
-        "ScaleSet": {"objects": {"Scale": scales}},
-        "preserve_mass_distribution": "true",
-        "output_model_file": f"{path.name.removeprefix('.').removesuffix('.partial').removesuffix('.xml')}.osim",
-    }
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
-    tool = {"GenericModelMaker": {"model_file": str(osim_model)}, "ModelScaler": scaler}
-    _write_setup(path, "ScaleTool", {"mass": "-1", **tool}, name)
-    return []
-
-
-def _bodies(motion: Motion) -> dict[str, np.ndarray]:
+def _find_bodies(motion: Motion) -> dict[str, np.ndarray]:
     bodies = orientations(motion.pose.quat_WL)
     if not bodies:
         raise BadData(f"{motion.where}: no segment in pose.parquet is a body of the model; there is none to write")
@@ -204,33 +101,123 @@ def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Ma
         for body, quat in quat_GB.items()
     }
     header = [f"DataRate={motion.rate_hz:f}", "DataType=Quaternion", "version=3", "=".join(OWN), "endheader"]
-    _write(path, header, pl.DataFrame({"time": time, **cells}))
+    _write_rows(path, header, pl.DataFrame({"time": time, **cells}))
+
+
+def list_setups(sto: Path) -> list[Path]:
+    """List what OpenSense needs beside a .sto: the placement, and the set-ups of IMU Placer and IK."""
+    return [sto.with_name(f"{sto.stem}{ending}") for ending in ("_placement.sto", "_placer.xml", "_ik.xml")]
+
+
+def write_setups(sto: Path, written: Sequence[Path], motion: Motion, model: str) -> None:
+    """Write what OpenSense needs beside the .sto of a motion, to `written` in the order of `list_setups`.
+
+    `model` is the name of the subject's model.
+    """
+    write_placement(written[0], motion)
+    placed_model = f"{sto.stem}_placed.osim"  # with sensors, which the IMU Placer writes
+    placer = {
+        "model_file": model,
+        "sensor_to_opensim_rotations": "0 0 0",
+        "orientation_file_for_calibration": f"{sto.stem}_placement.sto",
+        "output_model_file": placed_model,
+    }
+    _write_setup(written[1], "IMUPlacer", placer)
+    step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
+    ik = {
+        "model_file": placed_model,
+        "orientations_file": sto.name,
+        "sensor_to_opensim_rotations": "0 0 0",
+        "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
+        "report_errors": "true",
+        "results_directory": ".",
+        "output_motion_file": f"{sto.stem}_ik.mot",
+    }
+    _write_setup(written[2], "IMUInverseKinematicsTool", ik)
+
+
+# The model --------------------------------------------------------------------------------------------------------
+
+
+def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MODEL) -> None:
+    """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths.
+
+    The factors are over the lengths of Rajagopal's model. Masses stay. No markers are placed, so the tool's part for
+    them is left out.
+
+    Parameters
+    ----------
+    osim_model : name of the generic model
+    """
+    factors: dict[str, dict[str, float]] = {}
+    for length, place in LENGTHS.items():
+        if length in motion.model.lengths:
+            factor = motion.model.lengths[length] / place["generic"]
+            for body in place["bodies"]:
+                scaled = dict.fromkeys(place.get("axes", "xyz"), factor)
+                factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(scaled)
+    if not factors:
+        raise BadData(f"{motion.where}: the body has no length that OpenSim's model of a person has")
+    scales = [
+        {"scales": " ".join(f"{value:.9f}" for value in of.values()), "segment": body, "apply": "true"}
+        for body, of in factors.items()
+    ]
+    scaler = {
+        "apply": "true",
+        "scaling_order": "manualScale",
+        "ScaleSet": {"objects": {"Scale": scales}},
+        "preserve_mass_distribution": "true",
+        "output_model_file": f"{_final_name(path).removesuffix('.xml')}.osim",
+    }
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
+    tool = {"GenericModelMaker": {"model_file": str(osim_model)}, "ModelScaler": scaler}
+    _write_setup(path, "ScaleTool", {"mass": "-1", **tool}, name)
+
+
+def _write_setup(path: Path, tool: str, properties: Mapping[str, Any], name: str = "") -> None:
+    def add(parent: Element, properties: Mapping[str, Any]) -> None:
+        for key, value in properties.items():
+            for each in value if isinstance(value, list) else [value]:  # objects of the same name
+                child = SubElement(parent, key)
+                if isinstance(each, Mapping):
+                    add(child, each)
+                else:
+                    child.text = each
+
+    document = Element("OpenSimDocument", Version="40000")
+    add(SubElement(document, tool, name=name or tool), properties)
+    indent(document, "\t")
+    path.write_bytes(tostring(document, encoding="UTF-8", xml_declaration=True) + b"\n")
 
 
 # Points -----------------------------------------------------------------------------------------------------------
 
 
-def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Points in G, in mm; a point in a gap has empty cells."""
+def write_trc(path: Path, motion: Motion) -> None:
+    """Write points in G, in mm; a point in a gap has empty cells."""
     motion = resample_evenly(motion)
     points = find_measured_points(motion)
     n, rate = len(motion.pose.time), f"{motion.rate_hz:g}"
-    keys = "\t".join(_TRC_KEYS)
-    values = "\t".join((rate, rate, str(n), str(len(points)), "mm", rate, "1", str(n)))
-    labels = "Frame#\tTime\t" + "\t\t\t".join(points) + "\t\t"
-    axes = "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, len(points) + 1) for axis in "XYZ")
+    keys = {"DataRate": rate, "CameraRate": rate, "NumFrames": str(n), "NumMarkers": str(len(points)), "Units": "mm"}
+    keys |= {"OrigDataRate": rate, "OrigDataStartFrame": "1", "OrigNumFrames": str(n)}
+    header = [f"PathFileType\t4\t(X/Y/Z)\t{_final_name(path)}", "\t".join(keys), "\t".join(keys.values())]
+    header.append("Frame#\tTime\t" + "\t\t\t".join(points) + "\t\t")
+    header.append("\t\t" + "\t".join(f"{axis}{k}" for k in range(1, len(points) + 1) for axis in "XYZ"))
     columns = {
         f"{point}_{axis}": 1e3 * p_G
         for point, p_W in points.items()
         for axis, p_G in zip("XYZ", in_ground(p_W).T, strict=True)
     }
     rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
-    header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
-    _write(path, [*header, labels, axes, ""], rows, labels=False)
-    return []
+    _write_rows(path, [*header, ""], rows, labels=False)
 
 
-def _write(path: Path, header: list[str], rows: pl.DataFrame, labels: bool = True) -> None:
+def _final_name(path: Path) -> str:
+    """Return the name that a file gets when it is complete (`whole_file`)."""
+    return path.name.removeprefix(".").removesuffix(".partial")
+
+
+def _write_rows(path: Path, header: Sequence[str], rows: pl.DataFrame, labels: bool = True) -> None:
     with path.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode())
         rows.fill_nan(None).write_csv(
