@@ -286,19 +286,19 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "missing rows": (
         lambda f: setattr(f, "table", pl.concat([f.table.head(300), f.table.slice(307)])),
-        "arm.csv: rows are missing after row 300: time steps by 0.080 s at 2.990 s; up to 50 ms are bridged",
+        "arm.csv: sensors.torso.gyro: samples are missing for 0.070 s from 3.000 s, after row 300; up to 50 ms",
     ),
     "a long gap in gyro": (
         lambda f: f.put("gy", slice(400, 406), None),
-        "arm.csv: sensors.torso.gyro: 6 samples without numbers, 0.060 s from 4.000 s; up to 50 ms",
+        "arm.csv: sensors.torso.gyro: samples are missing for 0.060 s from 4.000 s, after row 400; up to 50 ms",
     ),
     "a long gap in accel": (
         lambda f: f.put("ax", slice(10, 20), float("nan")),
-        "sensors.torso.accel: 10 samples without",
+        "sensors.torso.accel: samples are missing for 0.100 s from 0.100 s, after row 10",
     ),
     "a gap at the end": (
         lambda f: f.put("gx", slice(880, 900), None),
-        "20 samples without numbers, 0.200 s from 8.800",
+        "samples are missing for 0.200 s from 8.800",
     ),
     "clocks that do not overlap": (
         lambda f: setattr(

@@ -19,8 +19,7 @@ from wepose_pin.body.kinematics import Pose, build_pose_table, compute_pose, par
 from wepose_pin.body.subject import population_subject, subject_toml
 from wepose_pin.commands import main
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
-from wepose_pin.readers.c3d import read_c3d
-from wepose_pin.readers.markers import read_marker_table
+from wepose_pin.readers.reference import read_reference
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import Exported, export
 from wepose_pin.writers.motion import Motion, resample
@@ -176,7 +175,7 @@ def test_c3d_by_ezc3d(result: Path, pose: Pose, tmp_path: Path) -> None:
         if begin:
             p_mm = 1e3 * pose.points[f"{segment.partition('_')[0]}_{begin}"]
             np.testing.assert_allclose(transforms[k, :, :3, 3], p_mm, atol=1e-4)
-    reference = read_c3d(tmp_path / "x.c3d", read_marker_table())
+    reference = read_reference(tmp_path / "x.c3d")
     assert set(reference.points) == set(POINTS)
     for segment, quat_WL in pose.quat_WL.items():
         same = np.einsum("nc,nc->n", reference.quat_VT[segment], quat_WL)

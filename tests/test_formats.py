@@ -603,9 +603,6 @@ def test_a_description_beside_the_session_is_read(stated: str, tmp_path: Path) -
         (('"mg"', '"furlong"'), r"'chest fx' is in 'furlong'; there is: m/s\^2, g, mg"),
         (('"t_ms"', '"t_s"'), r"walk\.csv: no line of names with 't_s' and columns of a signal"),
         (("title", "[title"), r"lab\.toml: not valid TOML"),
-        (("title", "units_before = '(?P<name>.*):'\ntitle"), r"lab\.toml: '.*' has no group 'unit'"),
-        (("title", "label_in_name = '.*_'\ntitle"), r"lab\.toml: '\.\*_' has no group 'label'"),
-        (("title", "units_line = 0.5\ntitle"), r"lab\.toml: units_line = 0\.5; a whole number of lines is needed"),
         (("[[accel]]", "[[gyro]]\ncolumns = []\n[[accel]]"), r"gyro 2\.columns = \[\]; one pattern or 3 names are"),
         (
             ("[[accel]]", '[[gyro]]\ncolumns = ["GX", "GY"]\n[[accel]]'),

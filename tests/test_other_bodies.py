@@ -24,11 +24,10 @@ from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
 from wepose_pin.tracking import TrackResult, summarize, track
 from wepose_pin.tracking.measures import measure_hinge, measure_tips
 from wepose_pin.writers.bvh import write_bvh
-from wepose_pin.writers.export import export
+from wepose_pin.writers.export import build_table, export
 from wepose_pin.writers.motion import Motion, find_measured_points
 from wepose_pin.writers.opensim import write_mot
 from wepose_pin.writers.result import read_result, write_result
-from wepose_pin.writers.export import build_table
 
 THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
 SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")

@@ -93,7 +93,7 @@ def dates(path: Path) -> None:
     [
         (german, 0.0, "'Zeit (ms)' is in ms, as its name says: 100 Hz"),
         (windows, 0.0, "'Zeit (ms)' is in ms, as its name says: 100 Hz"),
-        (epoch_ms, EPOCH, "'unix_timestamp' counts from 1970: the recording begins at 2023-11-14 22:13:20 UTC"),
+        (epoch_ms, EPOCH, "'unix_timestamp' is in ms, as it grows by 10 from row to row: 100 Hz"),
         (epoch_ns, EPOCH, "'timestamp' is in ns, as its name says: 100 Hz"),
         (two_lines, 0.0, "'time [us]' is in us, as its name says: 100 Hz"),
         (dates, 0.0, "'timestamp' holds dates; by the first and the last of them: 100 Hz"),

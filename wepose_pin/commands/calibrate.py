@@ -111,7 +111,7 @@ def calibrate(
     from .. import calibration as room
     from ..body.body import load_sensed_model
     from ..readers import load_session
-    from ..readers.subject import read_subject
+    from ..readers.mvnx import read_subject
     from ..report import calibration as report_room
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder

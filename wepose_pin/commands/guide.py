@@ -69,7 +69,7 @@ def run_guide(
     from ..live.session import open_and_wait, warm_up
     from ..live.steps import STATURE, make_steps
     from ..readers import load_session
-    from ..readers.subject import read_subject
+    from ..readers.mvnx import read_subject
     from ..report.calibration import write_calibration_page
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder

@@ -91,7 +91,7 @@ def track(
     from ..body.subject import parse_subject
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
-    from ..readers.subject import read_subject
+    from ..readers.mvnx import read_subject
     from ..report.pages import write_track_pages
     from ..report.viewer import MOST_FRAMES
     from ..tracking import CHUNK_S, SummaryAccumulator, TrackOptions, track_chunks

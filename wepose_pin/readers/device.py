@@ -111,7 +111,7 @@ def make_device(
     chosen = {label: signals for label, signals in found.items() if set(NEEDED[kind]) <= set(signals)}
     for label, signals in chosen.items():
         for signal in NEEDED[kind]:
-            check_measured(path, signals[signal].values, f"{signal} of {label}")
+            check_measured(f"{path}: {signal} of {label}", signals[signal].values)
         time, values = join_signals(f"{path.name} {label}", {name: signals[name] for name in NEEDED[kind]})
         if len(time) < FEWEST:
             raise BadData(f"{path}: holds {len(time)} samples of {label}; the export is empty or cut off")
@@ -207,12 +207,12 @@ def open_folder(path: Path) -> Iterator[dict[str, Path]]:
         yield {file.name: file for file in sorted(Path(unpacked).rglob("*")) if file.is_file()}
 
 
-def check_measured(path: Path, values: np.ndarray, what: str) -> None:
-    """Raise an error on numbers (n, k) beyond `LARGEST_NUMBER`."""
+def check_measured(place: str, values: np.ndarray) -> None:
+    """Raise an error on numbers (n, k) beyond `LARGEST_NUMBER`; `place` begins its text."""
     too_large = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
     if too_large.size:
         largest = np.nanmax(np.abs(values[too_large[0]]))
-        raise BadData(f"{path}: {what} holds {largest:.3g} in row {too_large[0] + 1}; no device measures as much")
+        raise BadData(f"{place} holds {largest:.3g} in row {too_large[0] + 1}; no device measures as much")
 
 
 def read_first_lines(path: Path, most: int = 100) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -13,10 +13,15 @@ from scipy.spatial.transform import Rotation
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, one_of
 
-SHIPPED = Path(__file__).parent / "markers.toml"
 SIDES = ({"side": "left", "S": "L", "s": "l"}, {"side": "right", "S": "R", "s": "r"})
 # The axes of a segment's frame (x forward, y left, z up in the N-pose) that a direction is of.
 DIRECTIONS = {"up": "z", "left": "y", "forward": "x", "lateral": "y"}
+# Table → what its entries look like.
+_FORMS = {
+    "points": '[["A", "B"], ["C"]], ways, each of markers',
+    "segments": '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions',
+    "rotations": "the name of a rotation",
+}
 
 
 class Reference(NamedTuple):
@@ -46,7 +51,7 @@ def read_marker_table(path: Path | None = None) -> MarkerTable:
     MissingFile, BadSession, BadData
         No such file; no TOML; an unknown key; an entry that is none.
     """
-    table = _read_table(SHIPPED)
+    table = _read_table(Path(__file__).with_suffix(".toml"))
     if path is None:
         return table
     own = _read_table(path)
@@ -62,11 +67,11 @@ def _read_table(path: Path) -> MarkerTable:
     top = TomlTable(read_toml(path, "a table of markers"), str(path))
     top.allow(*_FORMS)
     entries: dict[str, dict[str, Any]] = {key: {} for key in _FORMS}
-    for key, (form, is_of_form) in _FORMS.items():
+    for key, form in _FORMS.items():
         for name, value in top.table(key, {}).values.items():
             for side in SIDES if "{" in name else SIDES[:1]:
                 entry = _write_side(value, side)
-                if not is_of_form(entry):
+                if not _has_form(key, entry):
                     raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
                 entries[key][_write_side(name, side)] = entry
     return MarkerTable(**entries)
@@ -82,30 +87,20 @@ def _write_side(value: Any, side: Mapping[str, str]) -> Any:
     return {key: _write_side(each, side) for key, each in value.items()} if isinstance(value, dict) else value
 
 
-def _are_ways(value: Any) -> bool:
-    """Return whether a value is a list of lists of names."""
-    return isinstance(value, list) and all(
-        isinstance(way, list) and way and all(isinstance(name, str) for name in way) for way in value
-    )
-
-
-def _are_frames(value: Any) -> bool:
-    """Return whether a value is a list of two directions of different axes each, from markers to markers."""
+def _has_form(key: str, value: Any) -> bool:
+    """Return whether an entry of a table is what `_FORMS` says."""
+    if key == "rotations":
+        return isinstance(value, str)
+    if key == "points":
+        ways = value if isinstance(value, list) else [None]
+        return all(isinstance(way, list) and way and all(isinstance(name, str) for name in way) for way in ways)
     return isinstance(value, list) and all(
         isinstance(frame, dict)
         and len(frame) == 2
         and len({DIRECTIONS.get(each) for each in frame} - {None}) == 2
-        and all(_are_ways(ends) and len(ends) == 2 for ends in frame.values())
+        and all(_has_form("points", ends) and len(ends) == 2 for ends in frame.values())
         for frame in value
     )
-
-
-# Table → what its entries look like, and the test of one.
-_FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "points": ('[["A", "B"], ["C"]], ways, each of markers', _are_ways),
-    "segments": ('[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions', _are_frames),
-    "rotations": ("the name of a rotation", lambda value: isinstance(value, str)),
-}
 
 
 def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], table: MarkerTable) -> Reference:
@@ -137,21 +132,26 @@ def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tabl
 
 
 def _orient(segment: str, frame: Mapping[str, Sequence[Sequence[str]]], known: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Orient a segment (n, 4) xyzw by two directions, the first of which is kept; NaN where markers are missing."""
+    """Orient a segment (n, 4) xyzw by two directions, the first of which is exact; NaN where markers are missing."""
     axes: dict[str, np.ndarray] = {}
     for direction, (begin, end) in frame.items():
         sign = -1.0 if direction == "lateral" and segment.startswith("right") else 1.0
         along = np.mean([known[each] for each in end], axis=0) - np.mean([known[each] for each in begin], axis=0)
         axes[DIRECTIONS[direction]] = sign * along
-    (first, kept), (second, near) = axes.items()
+    (first, exact), (second, near) = axes.items()
     third = ({"x", "y", "z"} - {first, second}).pop()
     in_order = first + second in "xyzx"
-    across = np.cross(kept, near) if in_order else np.cross(near, kept)
+    across = np.cross(exact, near) if in_order else np.cross(near, exact)
     with np.errstate(invalid="ignore", divide="ignore"):
-        axes = {name: v / np.linalg.norm(v, axis=1)[:, None] for name, v in ((first, kept), (third, across))}
+        axes = {name: v / np.linalg.norm(v, axis=1)[:, None] for name, v in ((first, exact), (third, across))}
     axes[second] = np.cross(axes[third], axes[first]) if in_order else np.cross(axes[first], axes[third])
-    R = np.stack([axes[axis] for axis in "xyz"], axis=2)
+    return quat_from_matrices(np.stack([axes[axis] for axis in "xyz"], axis=2))
+
+
+def quat_from_matrices(R: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) xyzw of matrices (n, 3, 3), NaN where they are no rotations."""
     quat = np.full((len(R), 4), np.nan)
     good = np.isfinite(R).all(axis=(1, 2))
+    good &= np.abs(np.linalg.det(np.where(good[:, None, None], R, 0.0)) - 1.0) < 0.01
     quat[good] = Rotation.from_matrix(R[good]).as_quat()
     return quat

@@ -243,7 +243,7 @@ def _propose_time(proposal: Proposal, guess: Guess, arrays: ArrayFile | None) ->
 
 
 def _propose_rate(proposal: Proposal, dates: pl.DataFrame, lines: Sequence[str]) -> None:
-    """Propose the rate of a file without times in numbers: by its dates or times of day, or that which a line states."""
+    """Propose the rate of a file without times in numbers: by its dates or times of day, or as a line states it."""
     for name in dates.columns:
         texts = dates[name].cast(pl.String).str.strip_chars()
         for kind, form, tick_s in ((pl.Datetime("us"), None, 1e-6), (pl.Time, "%T%.f", 1e-9)):
@@ -356,5 +356,5 @@ def _propose_mount(recording: Recording, segment: str, static: Sequence[tuple[fl
     span = recording.span(static[0]) if static else slice(max(1, round(recording.rate_hz)))
     force = sensor.accel_S[span].mean(axis=0)
     up = max(AXES, key=lambda axis: float(AXES[axis] @ force))
-    where = "where it is static" if static else "in the first second"
-    return f'# mount = {{ up = "{up}", forward = "?" }}   # up as gravity says {where}; write the axis ahead for ?, without the #'
+    hint = f"up as gravity says {'where it is static' if static else 'in the first second'}"
+    return f'# mount = {{ up = "{up}", forward = "?" }}   # {hint}; write the axis ahead for ?, without the #'

@@ -1,28 +1,34 @@
-"""Files of other systems as a reference for `wepose evaluate`: C3D, MVNX, and TRC, markers as OpenSim writes them.
+"""Files of other systems as a reference for `wepose evaluate`: MVNX, C3D, and TRC, markers as OpenSim writes them.
+
+C3D, by ezc3d: points in POINT:UNITS at POINT:RATE; a residual below 0, NaN or zeros mark a missing one. Labels lose a
+subject before a colon. Rotations (HAS-Motion's extension, as Theia3D writes it) are 4×4 transforms of a segment to the
+laboratory at ROTATION:RATE, labelled ``l_uarm_4X4``, or ``left_upper_arm_4X4`` by `wepose export`.
 
 A TRC has ``PathFileType``, a line of keys and one of values (``Units`` mm, cm or m), a line of names (one every third
 cell), one of ``X1 Y1 Z1 …``, then rows ``frame time x y z …``, separated by tabs. Empty cells are missing markers.
 
-Source: opensim-core, `TRCFileAdapter.cpp`.
+Sources: the C3D File Format user guide (c3d.org); HAS-Motion's description of ROTATION; opensim-core,
+`TRCFileAdapter.cpp`.
 """
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from ..data_tables import read_body
 from ..errors import BadData, one_of
-from ..libraries import check_file, library_errors
-from .c3d import read_c3d
+from ..libraries import check_file, import_library, library_errors
 from .device import check_measured, read_first_lines
-from .markers import MarkerTable, Reference, locate, read_marker_table
+from .markers import MarkerTable, Reference, locate, quat_from_matrices, read_marker_table
 from .mvnx import read_mvnx_reference
 
 SUFFIXES = (".c3d", ".trc", ".mvnx")
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "millimeters": 1e-3}
 
 
 def is_reference(path: Path) -> bool:
@@ -43,11 +49,76 @@ def read_reference(path: Path, markers: Path | None = None) -> Reference:
     if suffix == ".mvnx":
         return read_mvnx_reference(path)
     table = read_marker_table(markers)
-    return _read_trc(path, table) if suffix == ".trc" else read_c3d(path, table)
+    if suffix == ".trc":
+        return locate(path, *_read_trc(path), table)
+    ezc3d = import_library("ezc3d", path, "a C3D")
+    with library_errors(path, "a C3D"):
+        file = ezc3d.c3d(str(path))
+    if not file["data"]["rotations"].size:
+        return locate(path, *_read_markers(path, file), table)
+    reference = _read_rotations(path, file, table)
+    if file["data"]["points"].size and file["data"]["points"].shape[2] == len(reference.time):
+        time, places = _read_markers(path, file)
+        with contextlib.suppress(BadData):  # markers of which no joint follows
+            reference = reference._replace(points=locate(path, time, places, table).points)
+    return reference
 
 
-def _read_trc(path: Path, table: MarkerTable) -> Reference:
-    """Read the joints and segments that follow from the markers."""
+def _values(file: Any, group: str, name: str) -> list[Any]:
+    """Return the values of a parameter; none where it is not there."""
+    return list(file["parameters"].get(group, {}).get(name, {}).get("value", []))
+
+
+def _read_labels(file: Any, group: str) -> list[str]:
+    """Return the labels of a group; more than 255 go on in LABELS2 and so on."""
+    return [label.strip() for suffix in ("", *range(2, 17)) for label in _values(file, group, f"LABELS{suffix}")]
+
+
+def _read_rate(path: Path, file: Any, group: str) -> float:
+    rate_hz = float([*_values(file, group, "RATE"), 0.0][0])
+    if not 1.0 <= rate_hz <= 1e5:
+        raise BadData(f"{path}: {group}:RATE is {rate_hz:g}; frames a second are needed there")
+    return rate_hz
+
+
+def _read_markers(path: Path, file: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Read times (n,) [s] and marker → (n, 3) [m] of a C3D."""
+    points = file["data"]["points"][:3].transpose(2, 1, 0)
+    residuals = file["data"]["meta_points"]["residuals"][0].T
+    valid = np.isfinite(points).all(axis=2) & (residuals >= 0.0) & points.any(axis=2)
+    labels, (frames, used, _) = _read_labels(file, "POINT"), points.shape
+    if not used or not labels or frames < 2:
+        raise BadData(f"{path}: {used} points in {frames} frames, and no rotations; export the markers")
+    units = {text.strip().lower() for text in _values(file, "POINT", "UNITS") if text.strip()}
+    if len(units) != 1 or not units <= set(UNITS):
+        raise BadData(f"{path}: POINT:UNITS is {', '.join(sorted(units)) or 'missing'}; {one_of(UNITS)}")
+    metres = UNITS[units.pop()] * np.where(valid[:, :, None], points, np.nan)
+    check_measured(f"{path}: a marker", metres.reshape(frames, -1))
+    time = np.arange(frames) / _read_rate(path, file, "POINT")
+    return time, {label.rpartition(":")[2].strip(): metres[:, k] for k, label in enumerate(labels[:used])}
+
+
+def _read_rotations(path: Path, file: Any, table: MarkerTable) -> Reference:
+    """Read the segments' orientations among the rotations of a C3D."""
+    transforms = file["data"]["rotations"].transpose(3, 2, 0, 1)
+    labels = [label.removesuffix("_4X4") for label in _read_labels(file, "ROTATION")][: transforms.shape[1]]
+    if _values(file, "ROTATION", "RATE"):
+        rate_hz = _read_rate(path, file, "ROTATION")
+    else:
+        rate_hz = _read_rate(path, file, "POINT") * float([*_values(file, "ROTATION", "RATIO"), 1.0][0])
+    quats = {}
+    for segment, name in table.rotations.items():
+        label = next((each for each in (name, segment) if each in labels), None)
+        if label is not None:
+            quats[segment] = quat_from_matrices(transforms[:, labels.index(label), :3, :3])
+    if not quats:
+        listed = ", ".join(labels[:8]) or "without labels"
+        raise BadData(f"{path}: its rotations are of no known segment ({listed}); name them under --markers")
+    return Reference(np.arange(len(transforms)) / rate_hz, quats, {}, own_frames=True)
+
+
+def _read_trc(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Read times (n,) [s] and marker → (n, 3) [m] of a TRC."""
     lines = read_first_lines(path, 5)
     if not lines[0].startswith("PathFileType"):
         raise BadData(f"{path}: is no TRC: its first line does not begin with PathFileType")
@@ -64,14 +135,12 @@ def _read_trc(path: Path, table: MarkerTable) -> Reference:
         body = read_body(path, 5)
         cells = pl.read_csv(body, has_header=False, separator="\t", schema=schema, missing_columns="insert")
         cells = cells.select(pl.all().str.strip_chars().replace("", None)).drop_nulls("1")
+        if cells["end"].count():
+            raise BadData(f"{path}: a row has more than the {len(columns)} cells of {len(names)} markers")
         rows = cells.select(columns).cast(pl.Float64).to_numpy()
-    if cells["end"].count():
-        row = int(cells["end"].is_not_null().arg_max() or 0) + 1
-        raise BadData(f"{path}: row {row} has more than the {len(columns)} cells of {len(names)} markers")
-    if len(rows) < 2:
-        raise BadData(f"{path}: {len(rows)} rows of markers; a recording has at least 2")
-    if not np.all(np.diff(rows[:, 1]) > 0.0):
-        raise BadData(f"{path}: the times of its rows do not increase")
-    check_measured(path, rows[:, 2:], "a marker")
+    if len(rows) < 2 or not np.all(np.diff(rows[:, 1]) > 0.0):
+        problem = "the times of its rows do not increase" if len(rows) > 1 else f"{len(rows)} rows of markers"
+        raise BadData(f"{path}: {problem}; a recording has at least 2 rows, and time grows")
+    check_measured(f"{path}: a marker", rows[:, 2:])
     points = UNITS[unit] * rows[:, 2:].reshape(len(rows), -1, 3)
-    return locate(path, rows[:, 1], {name: points[:, k] for k, name in enumerate(names)}, table)
+    return rows[:, 1], {name: points[:, k] for k, name in enumerate(names)}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import polars as pl
@@ -47,10 +47,8 @@ from .session_file import (
 
 T = TypeVar("T")
 
-# Allowed error of a quaternion's norm, from rounded decimals.
-NORM_ERROR = 1e-2
+NORM_ERROR = 1e-2  # of a quaternion, from rounded decimals
 MOST_LOST = 0.01  # share of samples lost in short gaps, above which it is a diagnostic
-GAP_LIMIT = "up to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
 
 
 def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | None = None) -> Recording:
@@ -71,7 +69,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     top = read_session_file(path, values)
     data, stated = top.table("data"), top.table("sensors", {})
     start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
-    files = _Files(path, data, gaps)
+    files = _Files(path, data)
     # Whether the names are segments, and the start pose one of theirs, is checked where the body is known.
     tables = {name: stated.table(name) for name in stated.values}
     keys = {name: read_sensor_keys(table, files.keys) for name, table in tables.items()}
@@ -100,6 +98,11 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         else files.read_sensor(tables[name], each)
         for name, each in keys.items()
     }
+    for name, each in measured.items():
+        if each.aligned and ("mount" in tables[name] or "orientation" not in each.values):
+            raise BadSession(
+                f"{tables[name].where}: aligned orientations are the segment's own: they need no mount, and no raw data"
+            )
     files.tables.clear()  # of a day they are gigabytes
     time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
     check_phases(str(path), time, head.phases)
@@ -108,12 +111,30 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     sensors: dict[str, Sensor] = {}
     diagnostics = [*resampled, *files.diagnostics, *check.diagnostics]
     for segment, each in measured.items():
-        sensor, marks = each.bridge_gaps(segment, check, gaps)
+        sensor, marks = _bridge_gaps(each, segment, check, gaps)
         sensors[segment] = resample(sensor, each.clock.time, time) if resampled else sensor
         diagnostics += _report_bridged_gaps(segment, marks, each.clock.step)
     recording = replace(head, time=time, rate_hz=measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics))
     check_recording(recording)
     return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
+
+
+class _Measured(NamedTuple):
+    """The samples of a sensor as its file has them."""
+
+    place: str  # the file and the sensor, for messages
+    columns: Mapping[str, list[str]]  # names in the file, by signal
+    clock: Clock  # its times, with lost rows filled in
+    values: Mapping[str, np.ndarray]  # signal → (n, k) in SI, of the rows of the file
+    mount: np.ndarray | None  # (4,) xyzw, sensor to segment; None: not stated
+    aligned: bool  # its orientations are the segment's own
+
+    def list_samples(self) -> tuple[np.ndarray, ...]:
+        """List the times (n,) [s] of the file's rows, and the values of each signal."""
+        clock = self.clock
+        # Without lost rows no copy is made.
+        time = clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
+        return (time, *self.values.values())
 
 
 # Files -------------------------------------------------------------------------------------------------------------
@@ -122,9 +143,8 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
 class _Files:
     """The files that a session names, each read once."""
 
-    def __init__(self, path: Path, data: TomlTable, gaps: bool) -> None:
-        self.path, self.data, self.gaps = path, data, gaps
-        self.keys = read_data_keys(data)
+    def __init__(self, path: Path, data: TomlTable) -> None:
+        self.path, self.data, self.keys = path, data, read_data_keys(data)
         self.tables: dict[Path, pl.DataFrame] = {}
         self.diagnostics: list[Diagnostic] = []  # what devices assumed, and files whose times are those of packets
         self._devices: dict[tuple[object, ...], Device] = {}
@@ -160,29 +180,34 @@ class _Files:
         return self._devices[key]
 
     def take_sensor(self, segment: str, table: TomlTable, keys: SensorKeys, devices: Mapping[str, Device]) -> _Measured:
-        """Take a sensor of a device's file.
+        """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor.
 
         Devices whose clocks start at power-on are shifted together, so that the earliest begins at zero.
         """
         path, device = self._find_file(keys), devices[segment]
-        label = _choose_label(table, keys, device, segment, path)
+        labels = [label for label, each in device.sensors.items() if each.segment == segment] or list(device.sensors)
+        if keys.label:
+            labels = [table.choice("label", device.sensors, keys.label)]
+        if len(labels) != 1:
+            raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
+        (label,) = labels
         sensor = device.sensors[label]
         time = sensor.time
         if device.since_power_on:
             running = [each for each in devices.values() if each.since_power_on]
             begins = [_unwrap_begin(each, running[0].begin) for each in running]
             time = time - device.begin + _unwrap_begin(device, running[0].begin) - min(begins)
-        mount = sensor.mount if keys.mount is None else keys.mount
-        columns = {signal: [f"{label} {signal}"] for signal in sensor.signals}
         clock = self._build_clock((path, id(sensor.time), keys.offset_s), path, time + keys.offset_s, str(path))
+        columns = {signal: [f"{label} {signal}"] for signal in sensor.signals}
+        mount = sensor.mount if keys.mount is None else keys.mount
         aligned = device.aligned if keys.aligned is None else keys.aligned
-        return _Measured(table, path, columns, clock, sensor.signals, mount, aligned)
+        return _Measured(f"{path}: {table.place}", columns, clock, sensor.signals, mount, aligned)
 
     # Of columns that the session names
 
     def read_sensor(self, table: TomlTable, keys: SensorKeys) -> _Measured:
         """Read the columns or arrays of a sensor."""
-        path, place = self._find_file(keys), table.where
+        path, is_array = self._find_file(keys), is_array_file(self._find_file(keys))
         if bool(keys.time) == (keys.rate_hz is not None):
             stated = "both is" if keys.time else "neither is"
             raise BadSession(
@@ -194,13 +219,13 @@ class _Files:
             if signal in keys.signals and units[signal] is None:
                 raise BadSession(f"{self._at(table, f'{signal}_unit')} is missing; {one_of(known)}")
         columns = dict(keys.signals)
-        if is_array_file(path):
+        if is_array:
             file = _open(self._arrays, ArrayFile, path)
             for signal, names in columns.items():
                 if len(names) == 1:
                     columns[signal] = file.expand(names[0], WIDTHS[signal], table.at(signal))
-            wanted = {name: table.at(signal) for signal, names in columns.items() for name in names}
-            content = file.table(wanted | ({keys.time: self._at(table, "time")} if keys.time else {}))
+            places = {name: table.at(signal) for signal, names in columns.items() for name in names}
+            content = file.table(places | ({keys.time: self._at(table, "time")} if keys.time else {}))
         else:
             for signal, names in columns.items():
                 if len(names) == 1:
@@ -211,8 +236,7 @@ class _Files:
         else:
             time, source = read_columns(content, [keys.time], str(path), self._at(table, "time"))[:, 0], str(path)
             time = TIME_UNITS[keys.time_unit] * time
-        own = place if is_array_file(path) else ""
-        key = (path, own, keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
+        key = (path, table.where if is_array else "", keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
         clock = self._build_clock(key, path, time + keys.offset_s, source)
         values = {
             signal: units[signal] * read_columns(content, names, str(path), table.at(signal))
@@ -221,40 +245,22 @@ class _Files:
         if path in self.tables:  # columns that have been read make room: of a day the table is gigabytes
             read = [name for names in columns.values() for name in names]
             self.tables[path] = content.with_columns(pl.lit(None).alias(name) for name in read)
-        return _Measured(table, path, columns, clock, values, keys.mount, bool(keys.aligned))
+        return _Measured(f"{path}: {table.place}", columns, clock, values, keys.mount, bool(keys.aligned))
 
     def _build_clock(self, key: tuple[object, ...], path: Path, time: np.ndarray, source: str) -> Clock:
-        """Build the clock of sensors; rows that are missing for long are an error where gaps are not accepted."""
-        if key in self._clocks:
-            return self._clocks[key]
-        self._clocks[key] = clock = build_clock(time, source)
-        if clock.packet > 1:
-            facts: dict[str, float | str] = {"variant": "packets", "packet": clock.packet}
-            self.diagnostics.append(Diagnostic("time-stamps-uneven", INFO, path.name, facts=facts))
-        lost = find_runs(mark_lost_samples(clock, clock.row >= 0) == LONG)
-        if lost and not self.gaps:
-            before, after = lost[0][0] - 1, lost[0][1]
-            raise BadData(
-                f"{path}: rows are missing after row {clock.row[before] + 1}: time steps by "
-                f"{clock.time[after] - clock.time[before]:.3f} s at {clock.time[before]:.3f} s; {GAP_LIMIT}"
-            )
-        return clock
+        """Build the clock of sensors, once of those that share it."""
+        if key not in self._clocks:
+            self._clocks[key] = clock = build_clock(time, source)
+            if clock.packet > 1:
+                facts: dict[str, float | str] = {"variant": "packets", "packet": clock.packet}
+                self.diagnostics.append(Diagnostic("time-stamps-uneven", INFO, path.name, facts=facts))
+        return self._clocks[key]
 
 
 def _open(opened: dict[Path, T], read: Callable[[Path], T], path: Path) -> T:
     if path not in opened:
         opened[path] = read(path)
     return opened[path]
-
-
-def _choose_label(table: TomlTable, keys: SensorKeys, device: Device, segment: str, path: Path) -> str:
-    """Choose the file's sensor on a segment: the stated label, the one with the segment's name, or the only sensor."""
-    if keys.label:
-        return table.choice("label", device.sensors, keys.label)
-    matches = [label for label, sensor in device.sensors.items() if sensor.segment == segment] or list(device.sensors)
-    if len(matches) != 1:
-        raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
-    return matches[0]
 
 
 def _unwrap_begin(device: Device, reference: float) -> float:
@@ -264,103 +270,68 @@ def _unwrap_begin(device: Device, reference: float) -> float:
     return device.begin + device.wraps_s * round((reference - device.begin) / device.wraps_s)
 
 
-# Sensors -----------------------------------------------------------------------------------------------------------
+# Gaps --------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Measured:
-    """The samples of a sensor as its file has them.
+def _bridge_gaps(measured: _Measured, segment: str, check: SensorCheck, gaps: bool) -> tuple[Sensor, np.ndarray]:
+    """Put the rows on the clock and bridge gaps; with the marks (n,) of lost samples.
 
-    Parameters
-    ----------
-    table : its table in the session
-    path, columns : the file, and the names of the columns in it, by signal
-    clock : its times, with lost rows filled in
-    values : signal → (n, k) in SI, of the rows of the file
-    mount : (4,) xyzw, sensor to segment; None: not stated
-    aligned : its orientations are the segment's own
+    Raises
+    ------
+    BadData
+        A signal has no numbers, or a gap is too long and `gaps` are not accepted.
     """
-
-    table: TomlTable
-    path: Path
-    columns: Mapping[str, list[str]]
-    clock: Clock
-    values: Mapping[str, np.ndarray]
-    mount: np.ndarray | None
-    aligned: bool
-
-    def __post_init__(self) -> None:
-        if self.aligned and ("mount" in self.table or "orientation" not in self.values):
-            raise BadSession(
-                f"{self.table.where}: aligned orientations are the segment's own: they need no mount, and no raw data"
-            )
-
-    def list_samples(self) -> tuple[np.ndarray, ...]:
-        """List the times (n,) [s] of the file's rows, and the values of each signal."""
-        clock = self.clock
-        # Without lost rows no copy is made.
-        time = clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
-        return (time, *self.values.values())
-
-    def bridge_gaps(self, segment: str, check: SensorCheck, gaps: bool) -> tuple[Sensor, np.ndarray]:
-        """Put the rows on the clock and bridge gaps; with the marks (n,) of lost samples.
-
-        Raises
-        ------
-        BadData
-            A signal has no numbers, or a gap is too long and `gaps` are not accepted.
-        """
-        clock = self.clock
-        faults = check.faults.get(segment, [])
-        frozen = np.zeros(len(clock.time), dtype=bool)
-        for fault in faults:
-            frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
-        signals, lost = {}, frozen.copy()
-        for name in self.values:
-            place = f"{self.path}: {self.table.place}{name}"
-            signals[name], good = self._place_on_clock(name, place)
-            if not good.any():
-                listed = ", ".join(self.columns[name])
-                raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {listed}")
-            if not gaps and (long := find_runs(mark_lost_samples(clock, good) == LONG)):
-                first, last = long[0]
-                raise BadData(
-                    f"{place}: {last - first} samples without numbers, {(last - first) * clock.step:.3f} s from "
-                    f"{clock.time[first]:.3f} s; {GAP_LIMIT}"
-                )
-            lost |= ~good
-        marks = mark_lost_samples(clock, ~lost)
-        gap = marks == LONG if gaps or faults else None
-        marks_reported = np.where(frozen, GOOD, marks)  # frozen samples have a diagnostic of their own
-        if "orientation" in signals:
-            quat = bridge_quat(signals["orientation"], marks, clock)
-            return OrientationSensor(quat, self.mount, gap, self.aligned), marks_reported
-        gyro_S = bridge(signals["gyro"], marks, clock, rate=True)
-        accel_S = bridge(signals["accel"], marks, clock)
-        return ImuSensor(gyro_S, accel_S, self.mount, gap, check.gyro_range[segment]), marks_reported
-
-    def _place_on_clock(self, name: str, place: str) -> tuple[np.ndarray, np.ndarray]:
-        """Put the values (n, k) of a signal on the clock, with a mask (n,) of the samples that exist."""
-        rows, clock = self.values[name], self.clock
-        check_measured(self.path, rows, f"{self.table.place}{name}")
-        exists = clock.row >= 0
-        if exists.all() and len(rows) == len(clock.row):
-            values = rows
-        else:
-            values = np.full((len(clock.row), rows.shape[1]), np.nan)
-            values[exists] = rows[clock.row[exists]]
-        good = np.isfinite(values).all(axis=1)
-        if name != "orientation":
-            return values, good
-        norm = np.linalg.norm(values, axis=1)
-        good &= norm > 0.0  # many exports write zeros for a lost sample
-        not_unit = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_ERROR))
-        if not_unit.size:
+    clock, faults = measured.clock, check.faults.get(segment, [])
+    frozen = np.zeros(len(clock.time), dtype=bool)
+    for fault in faults:
+        frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
+    signals, lost = {}, frozen.copy()
+    for name, rows in measured.values.items():
+        place = f"{measured.place}{name}"
+        check_measured(place, rows)
+        signals[name], good = _place_on_clock(rows, clock, place, name == "orientation")
+        if not good.any():
+            listed = ", ".join(measured.columns[name])
+            raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {listed}")
+        if not gaps and (long := find_runs(mark_lost_samples(clock, good) == LONG)):
+            first, last = long[0]
             raise BadData(
-                f"{place} has length {norm[not_unit[0]]:.3g} in row {clock.row[not_unit[0]] + 1}; a unit quaternion is "
-                f"needed, columns in the order x, y, z, w"
+                f"{place}: samples are missing for {(last - first) * clock.step:.3f} s from {clock.time[first]:.3f} s, "
+                f"after row {clock.row[:first].max(initial=-1) + 1}; up to 50 ms are bridged; cut the recording there, "
+                f"or accept gaps by --gaps (gaps=True)"
             )
-        return values / np.where(good, norm, np.nan)[:, None], good
+        lost |= ~good
+    marks = mark_lost_samples(clock, ~lost)
+    gap = marks == LONG if gaps or faults else None
+    marks_reported = np.where(frozen, GOOD, marks)  # frozen samples have a diagnostic of their own
+    if "orientation" in signals:
+        quat = bridge_quat(signals["orientation"], marks, clock)
+        return OrientationSensor(quat, measured.mount, gap, measured.aligned), marks_reported
+    gyro_S = bridge(signals["gyro"], marks, clock, rate=True)
+    accel_S = bridge(signals["accel"], marks, clock)
+    return ImuSensor(gyro_S, accel_S, measured.mount, gap, check.gyro_range[segment]), marks_reported
+
+
+def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Put the values (n, k) of a signal on the clock, with a mask (n,) of the samples that exist."""
+    exists = clock.row >= 0
+    if exists.all() and len(rows) == len(clock.row):
+        values = rows
+    else:
+        values = np.full((len(clock.row), rows.shape[1]), np.nan)
+        values[exists] = rows[clock.row[exists]]
+    good = np.isfinite(values).all(axis=1)
+    if not is_quat:
+        return values, good
+    norm = np.linalg.norm(values, axis=1)
+    good &= norm > 0.0  # many exports write zeros for a lost sample
+    not_unit = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_ERROR))
+    if not_unit.size:
+        raise BadData(
+            f"{place} has length {norm[not_unit[0]]:.3g} in row {clock.row[not_unit[0]] + 1}; a unit quaternion is "
+            f"needed, columns in the order x, y, z, w"
+        )
+    return values / np.where(good, norm, np.nan)[:, None], good
 
 
 def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:

@@ -119,17 +119,14 @@ def check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys
 
 def check_effect(data: TomlTable, tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
     """Raise `BadSession` where a key has no effect on its sensor, or one in [data] on none of the sensors."""
-    owners = [(tables[name], [each]) for name, each in keys.items()]
-    for table, sensors in [*owners, (data, list(keys.values()))]:
-        if all(each.signals for each in sensors):
-            unused, why = _OF_FORMATS, "the columns are named here"
-        elif not any(each.signals for each in sensors):
+    for table, sensors in [*((tables[name], [each]) for name, each in keys.items()), (data, list(keys.values()))]:
+        named = {bool(each.signals) for each in sensors}
+        unused, why = _OF_FORMATS, "the columns are named here"
+        if named == {False}:
             unused, why = _OF_COLUMNS, "the format of the file defines it"
-        else:
-            continue
-        for key in unused:
-            if key in table:
-                raise BadSession(f"{table.at(key)} has no effect, as {why}; remove it")
+        key = next((key for key in unused if key in table), None)
+        if key and len(named) == 1:
+            raise BadSession(f"{table.at(key)} has no effect, as {why}; remove it")
 
 
 def read_phases(keys: TomlTable) -> dict[str, Intervals]:
@@ -137,12 +134,10 @@ def read_phases(keys: TomlTable) -> dict[str, Intervals]:
     keys.allow(*keys.values, renamed=_RENAMED_PHASES)
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
-        valid = isinstance(value, list) and all(
-            isinstance(pair, list) and len(pair) == 2 and all(is_number(v) for v in pair) for pair in value
-        )
-        if not valid:
+        pairs: list[Any] = value if isinstance(value, list) else [None]
+        if not all(isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) for pair in pairs):
             raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
-        phases[name] = tuple((float(a), float(b)) for a, b in value)
+        phases[name] = tuple((float(a), float(b)) for a, b in pairs)
         for first, last in phases[name]:
             if not first < last:
                 raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
@@ -175,10 +170,8 @@ def find_model(path: Path, top: TomlTable) -> str:
 def find_truth(path: Path, data: TomlTable) -> Path | None:
     """Find the file with the truth beside the session file `path`; None: the session has none."""
     name = data.text("truth", None)
-    if name is None:
-        return None
-    if not (path.parent / name).is_file():
+    if name is not None and not (path.parent / name).is_file():
         raise MissingFile(
-            f"{data.at('truth')}: no such file '{name}' beside {path.name}; name it rightly or not at all"
+            f"{data.at('truth')}: no such file '{name}' beside {path.name}; name it rightly or leave it out"
         )
-    return path.parent / name
+    return None if name is None else path.parent / name

@@ -1,6 +1,6 @@
 """Tables of devices: a TOML describes how a vendor writes them, and one engine reads them all.
 
-A description (`formats/*.toml`, or a user's own, docs/formats.md) says how a file is recognised, which lines
+A description (`formats/*.toml`, or a user's own; its keys: docs/formats.md) says how a file is recognised, which lines
 belong to the names of its columns, which columns are whose gyroscope, accelerometer or orientation, their units, and
 the clock.
 """
@@ -51,22 +51,12 @@ _Line = Annotated[float, Key(least=-MOST_AFTER, most=MOST_AFTER)]  # counted fro
 
 
 class Columns(NamedTuple):
-    """Columns of a signal; keys as in docs/formats.md.
+    """Columns of a signal."""
 
-    Parameters
-    ----------
-    columns : one pattern of their names with a group `axis`, and `sensor`, `side` (a further part of its name), `unit`;
-        or the names of a file with one sensor: x, y, z of vectors. An orientation has w, x, y, z, or the nine cells of
-        a matrix by rows, or roll, pitch and yaw [deg]
-    unit : where neither the name nor a line of units has it
-    limit : [SI] where a value is beyond, the next columns of the format are taken if they are there
-    increments : the values are increments over a sample: a quaternion of the rotation, m/s
-    """
-
-    columns: tuple[str, ...]
-    unit: str = ""
-    limit: float = np.inf
-    increments: bool = False
+    columns: tuple[str, ...]  # one pattern with groups axis, sensor, side, unit; or the names of a file with one sensor
+    unit: str = ""  # where neither the name nor a line of units has it
+    limit: float = np.inf  # [SI] where a value is beyond, the next columns of the format are taken if they are there
+    increments: bool = False  # over a sample: a quaternion of the rotation, m/s
 
     def match(self, name: str, axes: str) -> tuple[str, int, str] | None:
         """Return sensor, index among the columns, and unit of a column; None: it is none of these."""
@@ -81,28 +71,18 @@ class Columns(NamedTuple):
 
 
 class ClockColumn(NamedTuple):
-    """A column that gives the time.
+    """A column that gives the time."""
 
-    Parameters
-    ----------
-    column : pattern of its name; a group `sensor` says whose it is
-    unit_s : [s]
-    wraps : value at which it begins again at 0
-    rate : pattern of the line before the table that states the rate of which the column counts the samples
-    date : how it is written where it is no number
-    spread : equal times are those of a packet, and are spread up to the next
-    """
-
-    column: str
-    unit_s: Annotated[float, Key(name="unit_s")] = 1.0
-    wraps: Annotated[float | None, Key(most=1e12)] = None
-    rate: str = ""
-    date: str = ""
-    spread: bool = False
+    column: str  # pattern of its name; a group `sensor` says whose it is
+    unit_s: Annotated[float, Key(name="unit_s")] = 1.0  # [s]
+    wraps: Annotated[float | None, Key(most=1e12)] = None  # value at which it begins again at 0
+    rate: str = ""  # pattern of the line before the table with the rate of which the column counts the samples
+    date: str = ""  # how it is written where it is no number
+    spread: bool = False  # equal times are those of a packet
 
 
 class TableFormat(NamedTuple):
-    """A description of tables; keys as in docs/formats.md."""
+    """A description of tables."""
 
     title: str = ""
     needs: str = ""
@@ -150,10 +130,10 @@ class TableFormat(NamedTuple):
         kind = use or next((kind for kind in NEEDED if _has(sensors, kind)), "raw")
         joins = self.times_before or len(tables) > 1  # a rate is that of the joined signals
         alone = tables[0].about.get(self.label_line) or _name_alone(self, path)
-        found: dict[str, dict[str, Signal]] = {}
+        devices: dict[str, dict[str, Signal]] = {}
         wraps_s = None
         for sensor, signals in sensors.items():
-            own = found.setdefault(sensor or alone, {})
+            own = devices.setdefault(sensor or alone, {})
             for name in NEEDED[kind] if set(NEEDED[kind]) <= set(signals) else ():
                 first, *others = signals[name]
                 time, wraps_s = _read_time(self, first, sensor, None if joins else rate_hz)
@@ -166,7 +146,7 @@ class TableFormat(NamedTuple):
         if self.sync_line and not tables[0].about.get(self.sync_line, "synced").lower().startswith("synced"):
             diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
         needs = f"{self.needs}; it has: {', '.join(filter(None, tables[0].names[:12]))}"
-        device = make_device(path, found, needs, use, rate_hz if joins else None, diagnostics)
+        device = make_device(path, devices, needs, use, rate_hz if joins else None, diagnostics)
         return replace(device, wraps_s=None if joins else wraps_s)
 
     def is_time(self, name: str) -> bool:
@@ -188,30 +168,24 @@ def load_format(path: Path) -> TableFormat:
     Raises
     ------
     WeposeError
-        The file is missing or no description: an unknown or wrong key, a pattern that is none or lacks a group.
+        The file is missing or no description: an unknown or wrong key, or a pattern that is none.
     """
     table = TomlTable(read_toml(path, "a description of tables"), str(path))
     format = read_record(TableFormat, table, others=("files", "clock", *AXES))
-    for key in ("sensors_line", "axes_line", "units_line"):
-        if getattr(format, key) % 1:
-            raise BadSession(f"{table.at(key)} = {getattr(format, key):g}; a whole number of lines is needed")
     signals = {signal: tuple(_read_columns(signal, each) for each in table.entries(signal)) for signal in AXES}
     clocks = tuple(read_record(ClockColumn, each) for each in table.entries("clock"))
     if not clocks or not (signals["orientation"] or (signals["gyro"] and signals["accel"])):
         raise BadSession(f"{path}: needs [[clock]], and [[gyro]] and [[accel]], or [[orientation]]")
     keys = table.table("files", {})
     keys.allow(*NEEDED)
-    groups: dict[str, tuple[str, ...]] = dict.fromkeys([*format.detect, format.sensor_begins], ())
-    groups |= {text: () for clock in clocks for text in (clock.column, clock.rate)}
-    groups |= {each.columns[0]: () for of in signals.values() for each in of if len(each.columns) == 1}
-    groups |= {format.units_before: ("name", "unit"), format.label_in_name: ("label",)}
-    for text, needed in groups.items():
+    patterns = [*format.detect, format.sensor_begins, format.units_before, format.label_in_name]
+    patterns += [text for clock in clocks for text in (clock.column, clock.rate)]
+    patterns += [each.columns[0] for own in signals.values() for each in own if len(each.columns) == 1]
+    for text in patterns:
         try:
-            known = re.compile(text).groupindex
+            re.compile(text)
         except (re.error, RecursionError, OverflowError) as error:
             raise BadSession(f"{path}: '{text}' is no regular expression: {error}") from None
-        if text and (missing := [group for group in needed if group not in known]):
-            raise BadSession(f"{path}: '{text}' has no group '{missing[0]}'; write (?P<{missing[0]}>...) around it")
     return format._replace(
         title=format.title or path.stem,
         needs=format.needs or " and ".join(signal for signal in AXES if signals[signal]),
@@ -225,8 +199,8 @@ def _read_columns(signal: str, entry: TomlTable) -> Columns:
     columns = read_record(Columns, entry)
     counts = (4,) if signal == "gyro" and columns.increments else _COUNTS[signal]
     if len(columns.columns) not in counts:
-        wanted = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
-        raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {wanted} are needed")
+        needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
+        raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {needed} are needed")
     return columns
 
 
@@ -272,8 +246,53 @@ class DeviceTable:
         names = [self.names[k] for k in columns]
         table = self.cells.select(pl.col(str(k)).alias(self.names[k]) for k in columns)
         values = read_columns(table, names, str(self.path), str(self.path))
-        check_measured(self.path, values, ", ".join(names))
+        check_measured(f"{self.path}: {', '.join(names)}", values)
         return values
+
+
+def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
+    """Parse a table; None: it has no line of names, with a column of time and one of a signal.
+
+    Raises
+    ------
+    MissingFile, BadData
+        The file is not readable; no rows; zero bytes in it.
+    """
+    lines = read_first_lines(path, MOST_LINES)
+    for k, line in enumerate(lines):
+        for separator in () if line.startswith(("//", "#")) else SEPARATORS:
+            if line.count(separator) < 3:
+                continue
+            names, units = _name_columns(format, lines, k, separator)
+            if any(map(format.is_time, names)) and any(map(format.is_signal, names)):
+                break
+        else:
+            continue
+        break
+    else:
+        return None
+    about = {}
+    for text in lines[:k]:
+        name, colon, value = text.strip("/ ").partition(":")
+        if colon:
+            about[name.strip()] = value.strip(f" {SEPARATORS}")
+    first = k + 1 + int(max(format.axes_line, format.units_line, 0.0))
+    for cells in (_split(row, separator) for row in lines[first : first + MOST_AFTER]):
+        if any(map(_NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
+            break
+        first += 1
+    body = read_body(path, first)
+    if b"\0" in body or not body.strip():
+        content = "zero bytes" if body.strip() else f"no line of numbers after the names in line {k + 1}"
+        raise BadData(f"{path}: there is {content} in it; the export is damaged, empty or cut off")
+    width = max(len(names), body.partition(b"\n")[0].count(separator.encode()) + 1)
+    table = parse_rows(path, body, [str(column) for column in range(width)], separator, lenient=True)
+    last = max(column for column, name in enumerate(names) if name)
+    if table.height and not body.endswith(b"\n") and table[str(last)][-1] is None:
+        table = table.head(-1)  # the last line is incomplete
+    columns = [str(column) for column, name in enumerate(names) if format.is_time(name) or format.is_signal(name)]
+    table = table.select(columns).filter(pl.any_horizontal(pl.all().is_not_null()))
+    return DeviceTable(path, names, units, about, table)
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -305,81 +324,14 @@ def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: 
         name = own[column] or (name if format.axes_line and axes[column] else "")
         names.append("/".join(filter(None, (sensors[column], name, axes[column]))))
     if format.units_before:
-        stated = {match["name"]: match["unit"] for line in lines[:k] if (match := _match(format.units_before, line))}
-        units = [stated.get(name, "") for name in own]
+        stated = [match.groupdict() for line in lines[:k] if (match := _match(format.units_before, line))]
+        by_name = {groups.get("name"): groups.get("unit") or "" for groups in stated}
+        units = [by_name.get(name, "") for name in own]
     return names, units
 
 
-def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
-    """Parse a table; None: it has no line of names, with a column of time and one of a signal.
-
-    Raises
-    ------
-    MissingFile, BadData
-        The file is not readable; no rows; zero bytes in it.
-    """
-    lines = read_first_lines(path, MOST_LINES)
-    for k, line in enumerate(lines):
-        for separator in () if line.startswith(("//", "#")) else SEPARATORS:
-            if line.count(separator) < 3:
-                continue
-            names, units = _name_columns(format, lines, k, separator)
-            if any(map(format.is_time, names)) and any(map(format.is_signal, names)):
-                return _parse_rows(format, path, lines, k, separator, names, units)
-    return None
-
-
-def _parse_rows(
-    format: TableFormat,
-    path: Path,
-    lines: Sequence[str],
-    k: int,
-    separator: str,
-    names: Sequence[str],
-    units: Sequence[str],
-) -> DeviceTable:
-    """Parse what follows the line of names, number `k`."""
-    about = {}
-    for line in lines[:k]:
-        name, colon, value = line.strip("/ ").partition(":")
-        if colon:
-            about[name.strip()] = value.strip(f" {SEPARATORS}")
-    first = k + 1 + int(max(format.axes_line, format.units_line, 0.0))
-    for cells in (_split(row, separator) for row in lines[first : first + MOST_AFTER]):
-        if any(map(_NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
-            break
-        first += 1
-    body = read_body(path, first)
-    if b"\0" in body or not body.strip():
-        content = "zero bytes" if body.strip() else f"no line of numbers after the names in line {k + 1}"
-        raise BadData(f"{path}: there is {content} in it; the export is damaged, empty or cut off")
-    width = max(len(names), body.partition(b"\n")[0].count(separator.encode()) + 1)
-    table = parse_rows(path, body, [str(column) for column in range(width)], separator, lenient=True)
-    last = max(column for column, name in enumerate(names) if name)
-    if table.height and not body.endswith(b"\n") and table[str(last)][-1] is None:
-        table = table.head(-1)  # the last line is incomplete
-    columns = [str(column) for column, name in enumerate(names) if format.is_time(name) or format.is_signal(name)]
-    table = table.select(columns).filter(pl.any_horizontal(pl.all().is_not_null()))
-    return DeviceTable(path, names, units, about, table)
-
-
-# Sensors -----------------------------------------------------------------------------------------------------------
-
-
-class _Source(NamedTuple):
-    """Columns of a sensor's signal in a table, in their order."""
-
-    table: DeviceTable
-    format: Columns
-    columns: list[int]
-    unit: str
-
-
-_Sensors = dict[str, dict[str, list[_Source]]]  # sensor → signal → its complete columns, those to prefer first
-
-
 def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[DeviceTable]:
-    """Parse the file, or those of a folder or zip that hold what is wanted."""
+    """Parse the file, or those of a folder or zip that hold what is needed."""
     kinds = [use] if use else list(NEEDED)
     alone = path.is_file() and path.suffix.lower() != ".zip"
     table = parse_table(format, path) if alone else None
@@ -397,6 +349,21 @@ def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[Devic
     clock = " or ".join(f"'{clock.column}'" for clock in format.clocks)
     named = f"line of names with {clock} and columns of a signal in its first {MOST_LINES} lines"
     raise BadData(f"{path}: no {named}, which a {format.title} has; {format.needs} are needed")
+
+
+# Sensors -----------------------------------------------------------------------------------------------------------
+
+
+class _Source(NamedTuple):
+    """Columns of a sensor's signal in a table, in their order."""
+
+    table: DeviceTable
+    format: Columns
+    columns: list[int]
+    unit: str
+
+
+_Sensors = dict[str, dict[str, list[_Source]]]  # sensor → signal → its complete columns, those to prefer first
 
 
 def _has(sensors: _Sensors, kind: str) -> bool:
@@ -431,11 +398,11 @@ def _name_alone(format: TableFormat, path: Path) -> str:
     if path.is_dir() or any(fnmatch.fnmatch(path.name, pattern) for pattern in format.files.values()):
         return path.name if path.is_dir() else path.parent.name
     match = _match(format.label_in_name, path.stem) if format.label_in_name else None
-    return match["label"] if match else path.stem
+    return (match.groupdict().get("label") if match else None) or path.stem
 
 
 def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
-    """Read values in SI; an orientation as xyzw."""
+    """Read values in SI; an orientation as xyzw, NaN where there is none."""
     table = source.table
     values = table.numbers(source.columns)
     if signal == "orientation":
@@ -454,7 +421,7 @@ def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
 
 
 def _read_quat(path: Path, values: np.ndarray) -> np.ndarray:
-    """Return quaternions (n, 4) xyzw of wxyz, matrices by rows, or roll, pitch, yaw [deg]; NaN where there is none."""
+    """Return quaternions (n, 4) xyzw of wxyz, matrices by rows, or roll, pitch, yaw [deg]."""
     if values.shape[1] == 4:
         return values[:, [1, 2, 3, 0]]
     quat = np.full((len(values), 4), np.nan)

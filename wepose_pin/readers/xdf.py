@@ -54,7 +54,7 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
             label = name if owner == f"?{name.lower()}" or len(groups) == 1 else owner.removeprefix("?")
             for signal, channels in signals.items():
                 read = values[:, [columns.index(channel) for channel in channels]].astype(float)
-                check_measured(path, read, f"{signal} of {label}")
+                check_measured(f"{path}: {signal} of {label}", read)
                 if signal != "orientation":
                     unit = units[channels[0]] or _guess_unit(signal, read)
                     read = convert(path, signal, read, unit, channels[0])

@@ -264,7 +264,7 @@ def _is_of_robot(result: Result) -> bool:
 def _read_motion(
     result: Result, format: str, interval: tuple[float, float] | None, phase: str | None, rate_hz: float | None
 ) -> Any:
-    """Read the selected part of a motion, of at least two samples: a `Motion` for formats of a person, or `JointMotion`.
+    """Read the selected part of a motion, two samples at least: a `Motion` for formats of a person, or `JointMotion`.
 
     It is resampled where a rate is given.
     """

@@ -32,7 +32,7 @@ MOST_MISSED = np.deg2rad(12.0)
 
 
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
-    """Write joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
+    """Write joint angles in degrees: the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
     Beside the three angles of a joint ``<joint>_near_lock`` is 1 where the first and the third are not to be read. Of a
     mechanism it has the joints of its URDF by their names, in degrees, and in m those that slide.
