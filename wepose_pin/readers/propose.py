@@ -341,8 +341,9 @@ def _propose_phases(proposal: Proposal, recording: Recording, static: Sequence[t
     elif end - begin > 2.0:
         spans = example(begin + 0.5, min(begin + 4.5, end))
         yield f"# start = {spans}   # name the seconds in which the person stands still in the start pose"
-    known = set(proposal.sensors) <= set(proposal.body.segments)  # else an unknown one may be a needed one
-    if end - begin > 2.0 and proposal.body.draw.paths and not (known and set(proposal.body.needed) - set(proposal.sensors)):
+    body, sensors = proposal.body, set(proposal.sensors)
+    lacking = sensors <= set(body.segments) and set(body.needed) - sensors  # else an unknown one may be a needed one
+    if end - begin > 2.0 and body.draw.paths and not lacking:
         spans = example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
         yield f"# clasp = {spans}   # for wepose calibrate: the seconds in which the palms are held together"
 
