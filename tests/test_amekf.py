@@ -167,10 +167,10 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     filter_ = Amekf(of.noise, RATE, of.true[at.start - 1], params)
     rng = np.random.default_rng(2)
     half = 0.05 * rng.normal(size=(STATES, STATES))
-    scale = np.sqrt(np.diag(filter_.state.P))
-    filter_.state.P[:] = np.outer(scale, scale) * (np.eye(STATES) + half @ half.T)
-    filter_.state.x[V : P + 2] = 0.1, -0.2, 0.05, 0.02
-    x_before, P_start = filter_.state.x.copy(), filter_.state.P.copy()
+    scale = np.sqrt(np.diag(filter_.state["P"][0, :, :STATES]))
+    filter_.state["P"][0, :, :STATES][:] = np.outer(scale, scale) * (np.eye(STATES) + half @ half.T)
+    filter_.state["x"][0][V : P + 2] = 0.1, -0.2, 0.05, 0.02
+    x_before, P_start = filter_.state["x"][0].copy(), filter_.state["P"][0, :, :STATES].copy()
     blocks = np.empty(1, BLOCK)
     result = filter_.run(of.gyro[at], of.accel[at], np.full(25, still), blocks=blocks)
 
@@ -191,21 +191,21 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     r = [params.static_speed_std**2] * 2 if still else [params.speed_std**2 / T] * 2
     r += [params.static_bias_std**2 + variance / 25] * 3 if still else [params.position_std**2 / T] * 2
     gain = P_before @ H.T @ np.linalg.inv(H @ P_before @ H.T + np.diag(r))
-    np.testing.assert_allclose(filter_.state.P, P_before - gain @ H @ P_before, atol=1e-12, rtol=1e-7)
+    np.testing.assert_allclose(filter_.state["P"][0, :, :STATES], P_before - gain @ H @ P_before, atol=1e-12, rtol=1e-7)
     # The correction, from the strapdown's own end: the filter on a copy of which a block is a sample longer has it.
     open_ = Amekf(of.noise, RATE, of.true[at.start - 1], replace(params, block_s=0.26))
-    open_.state.x[:] = x_before
+    open_.state["x"][0][:] = x_before
     end = open_.run(of.gyro[at], of.accel[at], np.full(25, still)).quat_VS[-1]
     expected = np.array([0.0, 0.0, 0.0, 0.0, 0.0]) if still else np.zeros(4)
-    innovation = expected - H @ open_.state.x
+    innovation = expected - H @ open_.state["x"][0]
     if still:
         innovation[2:] += of.gyro[at].mean(axis=0)
     d = gain @ innovation
-    np.testing.assert_allclose(filter_.state.x[3:] - open_.state.x[3:], d[3:], atol=1e-12)
+    np.testing.assert_allclose(filter_.state["x"][0][3:] - open_.state["x"][0][3:], d[3:], atol=1e-12)
     turned = (Rotation.from_quat(result.quat_VS[-1]) * Rotation.from_quat(end).inv()).as_rotvec()
     np.testing.assert_allclose(turned, d[:3], atol=1e-12)
     R = Rotation.from_quat(result.quat_VS[-1]).as_matrix()
-    np.testing.assert_allclose(cov(result)[-1], R.T @ filter_.state.P[:3, :3] @ R, atol=1e-15)
+    np.testing.assert_allclose(cov(result)[-1], R.T @ filter_.state["P"][0, :, :STATES][:3, :3] @ R, atol=1e-15)
 
 
 def test_the_heading_is_nobody_s_to_measure() -> None:
@@ -254,7 +254,7 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
         filter_ = Amekf(of.noise, RATE, of.start, AmekfParams(gyro_matrix_std=0.01))
         learned = errors(of, filter_.run(wrong.gyro, wrong.accel, wrong.static).quat_VS)
         fixed = errors(of, run(wrong, AmekfParams(gyro_matrix_std=0.0)).quat_VS)
-        np.testing.assert_allclose(filter_.state.x[[M, M + 4, M + 8]], scale, atol=0.0035)
+        np.testing.assert_allclose(filter_.state["x"][0][[M, M + 4, M + 8]], scale, atol=0.0035)
         end = of.moving.nonzero()[0][-1000:]
         headings.append(
             [float(np.abs(np.degrees(rotations.heading(e[end].as_quat()))).mean()) for e in (learned, fixed)]
@@ -381,12 +381,12 @@ def test_hours_leave_the_covariance_a_covariance() -> None:
     filter_ = Amekf(of.noise, RATE, of.start)
     for _ in range(85):
         filter_.run(of.gyro, of.accel, of.static)
-    P = filter_.state.P
+    P = filter_.state["P"][0, :, :STATES]
     np.testing.assert_array_equal(P, P.T)
     scale = np.sqrt(np.diag(P))
     assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > -1e-9
-    assert np.abs(filter_.state.x).max() < 10.0
-    assert abs(np.linalg.norm(filter_.state.quat_VS) - 1.0) < 1e-14
+    assert np.abs(filter_.state["x"][0]).max() < 10.0
+    assert abs(np.linalg.norm(filter_.state["quat_VS"][0]) - 1.0) < 1e-14
 
 
 # Real recordings ---------------------------------------------------------------------------------------------------

@@ -197,10 +197,10 @@ def rotate_unit_by_rate(quat, wx, wy, wz, dt):  # type: ignore[no-untyped-def]
 
 @inlined
 def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← exp([x, y, z]) ⊗ quat``, renormalised; the vector is in W [rad]."""
+    """In place: ``quat ← exp([x, y, z]) ⊗ quat``, renormalised as there; the vector is in W [rad]."""
     s, ew = half_angle_terms(0.25 * (x * x + y * y + z * z))
     rx, ry, rz, rw = product(s * x, s * y, s * z, ew, quat[0], quat[1], quat[2], quat[3])
-    norm = 1.0 / np.sqrt(rx * rx + ry * ry + rz * rz + rw * rw)
+    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 

@@ -17,9 +17,8 @@ from ..recording import ImuSensor, Recording
 from ..recording.faults import find_faults, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE, STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
-from .base import AboutVertical, FilterRun, OrientationFilter
-from .gdc import Gdc, GdcParams
-from .ncf import Ncf, NcfParams
+from .base import FilterRun, OrientationFilter
+from .complementary import Gdc, GdcParams, Ncf, NcfParams
 from .noise import SensorNoise, estimate_noise
 from .published import PublishedSmekf
 from .sensors import (
@@ -43,7 +42,6 @@ __all__ = [
     "OFFLINE",
     "STATIC_ONLY",
     "TYPICAL",
-    "AboutVertical",
     "Amekf",
     "AmekfParams",
     "FilterRun",

@@ -1,4 +1,4 @@
-"""The interface of orientation filters: frozen parameters, a state apart from them, one compiled step for all uses."""
+"""What the orientation filters share: their protocol, their results, samples that were lost, runs in threads."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from ..compilation import inlined
 from ..errors import BadData
+from ..recording.limits import HIGHEST_RATE_SQUARED
 from .noise import SensorNoise
 
 T = TypeVar("T")
@@ -21,109 +21,93 @@ T = TypeVar("T")
 STATIC_TURN_NOISE = 8e-4
 START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so that P can be inverted
 
+# While the gyroscope is lost (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant
+# HOLD_S. While it is lost or saturated, the attitude's standard deviation grows by the motion that may have been
+# missed: after T seconds by LOST_RATE_STD T²/(T + HOLD_S), up to π.
+HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
+LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 
-class AboutVertical(NamedTuple):
-    """A filter's corrections about the vertical since its start, and what it knows of the bias there.
-
-    The fields are arrays over samples or over sensors.
-
-    Parameters
-    ----------
-    heading : [rad] sum of the corrections of its heading
-    rate : [rad/s] sum of the corrections of the gyroscope's bias, each at the attitude that the sensor had then
-    rate_var : [rad²/s²] variance of the bias now
-    """
-
-    heading: np.ndarray
-    rate: np.ndarray
-    rate_var: np.ndarray
-
-
-VERTICAL_COLUMNS = len(AboutVertical._fields)
-HEADING, RATE, RATE_VAR = range(VERTICAL_COLUMNS)
-
-
-@inlined
-def add_correction(sums, heading, rate, rate_var):  # type: ignore[no-untyped-def]
-    """Add a correction by `heading` [rad] and `rate` [rad/s] to `sums` (3,), a row of `AboutVertical`.
-
-    `rate_var` [rad²/s²] is the variance of the bias now.
-    """
-    sums[HEADING] += heading
-    sums[RATE] += rate
-    sums[RATE_VAR] = rate_var
+# Columns of `FilterRun.about_vertical`
+HEADING, RATE, RATE_VAR = range(3)
 
 
 class FilterRun(NamedTuple):
-    """Results of a run, one row a sample; V is the sensor's own world, as in `OrientationFilter`."""
+    """Results of a run, one row a sample; V is the sensor's own world, as in `OrientationFilter`.
+
+    `about_vertical` has what the filter does about the vertical, where headings are corrected from outside: [rad] the
+    sum of the corrections of its heading since the start, [rad/s] the sum of those of the gyroscope's bias, each at the
+    attitude that the sensor had then, and [rad²/s²] the variance of the bias now.
+    """
 
     quat_VS: np.ndarray  # (n, 4) xyzw, orientation after the sample
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
-    about_vertical: np.ndarray | None = None  # (n, 3) as `AboutVertical`; None: the filter has no covariance
+    about_vertical: np.ndarray | None  # (n, 3); None: the filter has no covariance
 
     def part(self, rows: slice | np.ndarray) -> FilterRun:
         """Return the samples `rows`, of a slice as views."""
         return FilterRun(*(None if values is None else values[rows] for values in self))  # type: ignore[arg-type]
 
-    def extended(self, n: int) -> FilterRun:
-        """Return arrays of n samples that begin with these; the others are to be filled."""
-        whole = make_run(n, covariance=self.attitude_cov is not None)
-        for values, own in zip(whole, self, strict=True):
-            if values is not None and own is not None:
-                values[: len(own)] = own
-        return whole
-
 
 def make_run(n: int, *, covariance: bool = True) -> FilterRun:
     """Return arrays for n samples, to be filled."""
     # One piece of memory for all takes half the time of four.
-    shapes = [(n, 4), (n, 3), *([(n, 3, 3), (n, VERTICAL_COLUMNS)] if covariance else [])]
+    shapes = [(n, 4), (n, 3), *([(n, 3, 3), (n, 3)] if covariance else [])]
     ends = np.cumsum([0, *map(math.prod, shapes)])
     memory = np.empty(ends[-1])
     arrays = [memory[ends[k] : ends[k + 1]].reshape(shape) for k, shape in enumerate(shapes)]
-    return FilterRun(*arrays, *([] if covariance else [None]))
+    return FilterRun(*arrays, *([] if covariance else [None, None]))
 
 
 def make_record(**values: Any) -> np.ndarray:
-    """Return a record (1,) with these fields, numbers or arrays, for a compiled step; all are floats.
+    """Return a record (1,) with these fields for a compiled step; what is no NumPy object becomes a float.
 
     A step is compiled for the types of the record, and a parameter may be stated as an integer.
     """
-    types = [(name, float, np.shape(value)) for name, value in values.items()]
+    types = [
+        (name, value.dtype if isinstance(value, np.generic | np.ndarray) else float, np.shape(value))
+        for name, value in values.items()
+    ]
     record = np.zeros(1, np.dtype(types, align=True))
     for name, value in values.items():
         record[name] = value
     return record
 
 
-@dataclass
-class FilterState:
-    """State of a filter without covariance."""
-
-    quat_VS: np.ndarray  # (4,) xyzw
-    gyro_bias: np.ndarray  # (3,) [rad/s]
-
-
-class OrientationFilter(Protocol):
+class OrientationFilter:
     """A filter made for one sensor: ``Filter(noise, rate_hz, quat_VS, params)``.
 
     V is the sensor's own world: z up, heading of the `quat_VS` from which the filter starts. A run, the same run cut
-    in two, and a run sample by sample are bit-identical.
+    in two, and a run sample by sample are bit-identical. A sample that is no number was lost.
+
+    Attributes
+    ----------
+    state, model : records (1,) of the compiled step: what changes with a sample, and constants
     """
 
-    def __init__(self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray) -> None: ...
+    params_type: type | None = None
+    has_covariance = True
+    _run: Callable[..., None]  # compiled: state, model, gyro_S, accel_S, static, and the arrays of a `FilterRun`
+
+    def __init__(self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: Any = None) -> None:
+        self.params = self.params_type() if params is None and self.params_type else params
+        self.noise, self.rate_hz = noise, rate_hz
+        self.state, self.model = self._make_records(np.asarray(quat_VS, dtype=float))
+
+    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        raise NotImplementedError
 
     def run(
-        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray, out: FilterRun | None = None
+        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
     ) -> FilterRun:
         """Take samples, `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²], `static` (n,) bool, or one without the n.
 
-        The state continues from the run before.
-
-        The result fills `out` and is `out`, where it is given.
+        The state continues from the run before. The result fills `out` and is `out`, where it is stated.
         """
-        ...
+        gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
+        out = out or make_run(len(gyro), covariance=self.has_covariance)
+        self._run(self.state, self.model, gyro, accel, is_static, *out[: 4 if self.has_covariance else 2])
+        return out
 
 
 def prepare_samples(
@@ -140,48 +124,42 @@ def prepare_samples(
     return gyro, accel, is_static
 
 
-# Symmetric 3×3 matrices and their upper triangles: xx xy xz yy yz zz -------------------------------------------------
+@inlined
+def bridge_rate(state, model, gx, gy, gz, bx, by, bz):  # type: ignore[no-untyped-def]
+    """Return the rate [rad/s] without the bias b, held while it is lost, and the variance [rad²] of what was missed.
 
-
-def symmetric(upper: np.ndarray) -> np.ndarray:
-    """Matrices (…, 3, 3) from their upper triangles (…, 6)."""
-    return upper[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    `state` has `last_rate` (3,) and `lost_s`, `model` has `dt` and `gyro_range`.
+    """
+    last, is_measured = state.last_rate, gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
+    if is_measured:
+        x, y, z = gx - bx, gy - by, gz - bz
+    else:
+        fade = max(0.0, 1.0 - model.dt / HOLD_S)
+        x, y, z = fade * last[0], fade * last[1], fade * last[2]
+    last[0], last[1], last[2] = x, y, z
+    lost_var = 0.0
+    if is_measured and max(abs(gx), abs(gy), abs(gz)) < model.gyro_range:
+        state.lost_s = 0.0
+    else:
+        before, after = state.lost_s, state.lost_s + model.dt
+        lost_var = (
+            min(np.pi, LOST_RATE_STD * after * after / (after + HOLD_S)) ** 2
+            - min(np.pi, LOST_RATE_STD * before * before / (before + HOLD_S)) ** 2
+        )
+        state.lost_s = after
+    return x, y, z, is_measured, lost_var
 
 
 @inlined
-def into_sensor(R, P, more, out):  # type: ignore[no-untyped-def]
-    """Upper triangle `out` (6,) of ``Rᵀ P R + more I`` of symmetric 3×3 `P`; `R` (3, 3)."""
-    xx, xy, xz, yy, yz, zz = P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]
-    at = 0
+def into_sensor(R, P, more, more_heading, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (3, 3) with ``Rᵀ (P + more_heading e_z e_zᵀ) R + more I``; `R` (3, 3), `P` (9,) symmetric."""
+    xx, xy, xz, yy, yz, zz = P[0], P[1], P[2], P[4], P[5], P[8] + more_heading
     for i in range(3):
         a, b, c = R[0, i], R[1, i], R[2, i]
         u, v, w = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
-        for j in range(i, 3):
-            out[at] = R[0, j] * u + R[1, j] * v + R[2, j] * w
-            at += 1
-    out[0] += more
-    out[3] += more
-    out[5] += more
-
-
-@inlined
-def fill_symmetric(upper, out):  # type: ignore[no-untyped-def]
-    """`out` (3, 3) of its upper triangle (6,)."""
-    out[0, 0], out[0, 1], out[0, 2] = upper[0], upper[1], upper[2]
-    out[1, 0], out[1, 1], out[1, 2] = upper[1], upper[3], upper[4]
-    out[2, 0], out[2, 1], out[2, 2] = upper[2], upper[4], upper[5]
-
-
-@inlined
-def store_sample(state, k, quat_VS, gyro_bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
-    """Fill row `k` of the arrays of a `FilterRun` from the record of a filter with covariance."""
-    for i in range(4):
-        quat_VS[k, i] = state.quat_VS[i]
-    for i in range(3):
-        gyro_bias[k, i] = state.gyro_bias[i]
-    fill_symmetric(state.attitude_cov, attitude_cov[k])
-    for i in range(VERTICAL_COLUMNS):
-        about_vertical[k, i] = state.about_vertical[i]
+        out[i, i] = a * u + b * v + c * w + more
+        for j in range(i):
+            out[i, j] = out[j, i] = R[0, j] * u + R[1, j] * v + R[2, j] * w
 
 
 def run_in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:

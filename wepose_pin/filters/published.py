@@ -13,43 +13,19 @@ import numpy as np
 from ..compilation import compiled
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, up_in_sensor
-from .base import HEADING, RATE, RATE_VAR, VERTICAL_COLUMNS, FilterRun, make_run, prepare_samples
-from .noise import SensorNoise
+from .base import HEADING, RATE, RATE_VAR, OrientationFilter, make_record
 
 START_VAR = 1e-3  # [rad²], [rad²/s²] P₀ of the authors' software
 
 
-class PublishedSmekf:
-    """sMEKF of one sensor, with the covariances of the authors' software. A sample that is no number is passed over.
-
-    `sensors.SensorFilters` gives it the paper's static test too.
-    """
-
-    def __init__(self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: None = None) -> None:
-        self.params, self.noise, self.rate_hz = params, noise, rate_hz
-        self.quat_VS, self.gyro_bias = np.array(quat_VS, dtype=float), noise.gyro_bias.copy()
-        self.P, self.about_vertical = START_VAR * np.eye(6), np.zeros(VERTICAL_COLUMNS)
-        self._Q, self._R = np.zeros((2, 6, 6))  # of [w_ω; w_b] and of [w_g; w_ω]
-        self._Q[:3, :3], self._Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov
-        self._R[:3, :3], self._R[3:, 3:] = noise.accel_cov, noise.gyro_cov
-
-    def run(
-        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
-    ) -> FilterRun:
-        gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        out = out or make_run(len(gyro))
-        state = self.quat_VS, self.gyro_bias, self.P, self.about_vertical
-        _run(*state, self._Q, self._R, gyro, accel / self.noise.gravity, is_static, 1.0 / self.rate_hz, *out)
-        return out
-
-
 @compiled
-def _run(quat, bias, P, vertical, Q, R, gyro_S, accel_g, static, dt, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
-    identity = np.eye(6)
+def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
+    quat, bias, P, vertical = states[0].quat_VS, states[0].gyro_bias, states[0].P, states[0].about_vertical
+    dt, Q, R, identity = models[0].dt, models[0].Q, models[0].R, np.eye(6)
     F, H = np.eye(6), np.zeros((6, 6))
     F[:3, 3:], H[3:, 3:] = -dt * identity[:3, :3], identity[:3, :3]
     for k in range(len(gyro_S)):
-        w, accel = gyro_S[k] - bias, accel_g[k]
+        w, accel = gyro_S[k] - bias, accel_S[k] / models[0].gravity
         if np.sum(gyro_S[k] ** 2) < HIGHEST_RATE_SQUARED:  # false for NaN
             rotate_by_vector(quat, w[0] * dt, w[1] * dt, w[2] * dt)
             _fill_cross(F, -dt * w, 1.0)  # I − [ω δt]×
@@ -74,3 +50,20 @@ def _fill_cross(A, v, diagonal):  # type: ignore[no-untyped-def]
     A[0, 0] = A[1, 1] = A[2, 2] = diagonal
     A[0, 1], A[0, 2], A[1, 0] = -v[2], v[1], v[2]
     A[1, 2], A[2, 0], A[2, 1] = -v[0], -v[1], v[0]
+
+
+class PublishedSmekf(OrientationFilter):
+    """sMEKF of one sensor, with the covariances of the authors' software. A sample that is no number is passed over.
+
+    `sensors.SensorFilters` gives it the paper's static test too.
+    """
+
+    _run = staticmethod(_run)
+
+    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        noise, Q, R = self.noise, np.zeros((6, 6)), np.zeros((6, 6))
+        Q[:3, :3], Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov  # of [w_ω; w_b]
+        R[:3, :3], R[3:, 3:] = noise.accel_cov, noise.gyro_cov  # of [w_g; w_ω]
+        P = START_VAR * np.eye(6)
+        state = make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias, P=P, about_vertical=np.zeros(3))
+        return state, make_record(dt=1.0 / self.rate_hz, gravity=noise.gravity, Q=Q, R=R)

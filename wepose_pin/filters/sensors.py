@@ -15,8 +15,7 @@ from ..errors import BadData, BadOption, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
 from .amekf import Amekf, AmekfParams
 from .base import FilterRun, make_run, run_in_parallel
-from .gdc import Gdc
-from .ncf import Ncf
+from .complementary import Gdc, Ncf
 from .noise import MOVING_TILT_STD, SensorNoise, StartTilt, estimate_start_tilt
 from .phases import find_reference_phases
 from .published import PublishedSmekf
@@ -52,7 +51,7 @@ class Orientation(NamedTuple):
         has none
     noise : of gyroscope and accelerometer in the static phase
     diagnostics : what the user should know
-    about_vertical : (n, 3), as `base.AboutVertical`; None where the filter has no covariance
+    about_vertical : (n, 3), as in `FilterRun`; None where the filter has no covariance
     """
 
     quat_VS: np.ndarray
@@ -200,7 +199,10 @@ class SensorFilters:
             backward, static_before = before
             rest = slice(len(static_before), None)
             static = np.concatenate([static_before, detector.run(gyro_S[rest], accel_S[rest])])
-            run = backward.extended(len(gyro_S))
+            run = make_run(len(gyro_S), covariance=filter_.has_covariance)
+            for values, earlier in zip(run, backward, strict=True):
+                if values is not None and earlier is not None:
+                    values[: len(earlier)] = earlier
             filter_.run(gyro_S[rest], accel_S[rest], static[rest], run.part(rest))
         quat_VS, gyro_bias, attitude_cov, about_vertical = run
         noise = self._noises[name]

@@ -18,37 +18,34 @@ import numpy as np
 from ..compilation import compiled
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
-from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun, fill_symmetric, into_sensor
-from .noise import SensorNoise
+from .base import HEADING, RATE, RATE_VAR, FilterRun, OrientationFilter, into_sensor
 
 COUNT = len(SMOOTHED_STATES)
 
 
-class Smoother:
+class Smoother(OrientationFilter):
     """Smoother of one sensor, for whole recordings; parameters are the aMEKF's.
 
     What bad data does is said at `Amekf`; a stretch without gyro is bridged from both sides.
     """
 
-    def __init__(
-        self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: AmekfParams | None = None
-    ) -> None:
-        self.params = params or AmekfParams()
-        self.noise = noise
-        self.rate_hz = rate_hz
-        self.quat_VS = np.array(quat_VS, dtype=float)
+    params_type = AmekfParams
+
+    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        filter_ = Amekf(self.noise, self.rate_hz, quat_VS, self.params)
+        return filter_.state, filter_.model
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
     ) -> FilterRun:
         """Smooth a whole recording; each call starts anew, so a recording cut in two is two recordings."""
-        amekf = Amekf(self.noise, self.rate_hz, self.quat_VS, self.params)
+        amekf = Amekf(self.noise, self.rate_hz, self.state["quat_VS"][0], self.params)
         is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
-        P_rows = np.ascontiguousarray(amekf.state.P[list(SMOOTHED_STATES)])
-        blocks = np.empty(len(is_static) // amekf.block_samples, BLOCK)
+        P_rows, size = amekf.state["P"][0, list(SMOOTHED_STATES), :STATES], int(amekf.model["block_samples"][0])
+        blocks = np.empty(len(is_static) // size, BLOCK)
         run = amekf.run(gyro_S, accel_S, is_static, out, blocks)
         smoothed = _backward(blocks, P_rows, self.noise.gravity)
-        _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), amekf.block_samples, is_static, *run)
+        _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, is_static, *run)
         return run
 
 
@@ -108,7 +105,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
         swapped = Lam.T.copy()
         _transpose_transition(block, gravity, swapped)
         Lam[:] = 0.5 * (swapped + swapped.T)
-    return deviation, covs[0], covs[1]
+    return deviation, covs[0].reshape(-1, 9), covs[1].reshape(-1, 9)
 
 
 @compiled
@@ -119,52 +116,37 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, qu
     the sample; of that and the variance from there to the end, the product over the sum is left, as in any bridge.
     `size`: samples of a block.
     """
-    R = np.empty((3, 3))
-    P = np.empty((3, 3))
-    upper = np.empty(6)
-    e = np.empty(COUNT)
+    R, P, e = np.empty((3, 3)), np.empty(9), np.empty(COUNT)
     for k in range(len(quat)):
         row = k // size
-        bridge = 0.0
-        if row >= len(blocks):  # the last block is not full: nothing was corrected in it
-            for n in range(COUNT):
-                e[n] = deviation[len(blocks), n]
-            for i in range(3):
-                for j in range(3):
-                    P[i, j] = cov[len(blocks), i, j]
-        else:
-            block = blocks[row]
-            share = (k % size + 1) / size
-            whole = k % size + 1 == size  # the filter has corrected this quaternion, not the bias it stated with it
-            lost = block.lost_rotation_var
-            if lost > 0.0 and not whole:
-                before = start_trace
-                if row > 0:
-                    last = blocks[row - 1].P_smoothed_rows
-                    before = 0.0
-                    for i in range(3):
-                        before += last[i, i]
-                so_far = attitude_cov[k, 0, 0] + attitude_cov[k, 1, 1] + attitude_cov[k, 2, 2]
-                so_far = min(max(0.0, (so_far - before) / 3.0), lost)
-                share = so_far / lost
-                bridge = so_far * (1.0 - share)
-            for n in range(COUNT):
-                after = deviation[row + 1, n] + (0.0 if whole and n < 3 else block.correction[SMOOTHED_STATES[n]])
-                e[n] = (1.0 - share) * deviation[row, n] + share * after
-            for i in range(3):
-                for j in range(3):
-                    P[i, j] = (1.0 - share) * cov[row, i, j] + share * cov[row + 1, i, j]
+        end = min(row + 1, len(blocks))  # the last block may not be full: nothing was corrected in it
+        whole = k % size + 1 == size  # the filter has corrected this quaternion, not the bias it stated with it
+        share, bridge = (k % size + 1) / size, 0.0
+        if row < len(blocks) and blocks[row].lost_rotation_var > 0.0 and not whole:
+            lost, before = blocks[row].lost_rotation_var, start_trace
+            if row > 0:
+                last = blocks[row - 1].P_smoothed_rows
+                before = last[0, 0] + last[1, 1] + last[2, 2]
+            so_far = attitude_cov[k, 0, 0] + attitude_cov[k, 1, 1] + attitude_cov[k, 2, 2]
+            so_far = min(max(0.0, (so_far - before) / 3.0), lost)
+            share = so_far / lost
+            bridge = so_far * (1.0 - share)
+        for n in range(COUNT):
+            after = deviation[end, n]
+            if row < len(blocks) and not (whole and n < 3):
+                after += blocks[row].correction[SMOOTHED_STATES[n]]
+            e[n] = (1.0 - share) * deviation[row, n] + share * after
+        for i in range(9):
+            P[i] = (1.0 - share) * cov[row, i] + share * cov[end, i]
         rotate_by_world_vector(quat[k], e[0], e[1], e[2])
         moving = 0.0 if static[k] else 1.0
         for c in range(3):
             bias[k, c] += e[3 + c] + moving * e[6 + c]
         fill_matrix(quat[k], R)
-        into_sensor(R, P, bridge, upper)
-        fill_symmetric(upper, attitude_cov[k])
+        into_sensor(R, P, bridge, 0.0, attitude_cov[k])
         # Smoothed headings and biases know the whole recording from the first sample on: nothing is corrected later.
-        for i in range(VERTICAL_COLUMNS):
-            about_vertical[k, i] = 0.0
-        at = min(row, len(blocks))
+        about_vertical[k, HEADING] = about_vertical[k, RATE] = variance = 0.0
         for i in range(3):
             for j in range(3):
-                about_vertical[k, RATE_VAR] += R[2, i] * R[2, j] * bias_cov[at, i, j]
+                variance += R[2, i] * R[2, j] * bias_cov[row, 3 * i + j]
+        about_vertical[k, RATE_VAR] = variance

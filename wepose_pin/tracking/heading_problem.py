@@ -81,7 +81,7 @@ class FilterHeadings(NamedTuple):
     Parameters
     ----------
     var : (k,) [rad²] of the heading
-    heading, rate, rate_var : (k,) as `wepose_pin.filters.AboutVertical`
+    heading, rate, rate_var : (k,) as the columns of `FilterRun.about_vertical`
     """
 
     var: np.ndarray

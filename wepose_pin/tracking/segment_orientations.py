@@ -16,8 +16,8 @@ from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..errors import BadOption
 from ..filters import BEST, OFFLINE, Orientation, check_method
+from ..filters.base import HOLD_S, LOST_RATE_STD
 from ..filters.noise import ACCEL_BIAS_STD
-from ..filters.smekf import HOLD_S, LOST_RATE_STD
 from ..filters.static import StaticTest
 from ..recording import Recording
 

@@ -46,7 +46,7 @@ class FilterOutput(NamedTuple):
 
     quat_VS: np.ndarray  # (n, k, 4) xyzw, of measured orientations too
     attitude_cov: np.ndarray  # (n, k, 3, 3) [rad²]
-    about_vertical: np.ndarray  # (n, k, 3) as `AboutVertical`
+    about_vertical: np.ndarray  # (n, k, 3) as in `FilterRun`
 
     def at(self, row: int) -> FilterHeadings:
         """What the filters know of their headings after a sample."""
