@@ -11,7 +11,7 @@ from wepose_pin.body.soft_tissue import SoftTissueCorrection, TissueMean, correc
 from wepose_pin.body.subject import Hinge, population_subject
 from wepose_pin.body.table_file import load_table
 from wepose_pin.calibration import calibrate
-from wepose_pin.simulation import IDEAL_PRESET, simulate, simulate_person
+from wepose_pin.simulation import IDEAL_PRESET, PEOPLE_MEASURED_STD, PEOPLE_PRESET, simulate, simulate_person
 from wepose_pin.tracking import track
 
 TABLE = load_table()
@@ -88,3 +88,11 @@ def test_a_hinge_shows_how_far_skin_lags_behind_a_twist(size: float) -> None:
         )
         errors.append(np.degrees(np.sqrt(np.mean((relative * true.inv()).as_rotvec() ** 2))))
     assert errors[0] < (0.7 * errors[1] if size else errors[1] + 0.1)
+
+
+def test_elbows_that_fit_hinges_well_do_not_overrule_the_clasp() -> None:
+    """Of a person with firm straps; elbows are no exact hinges however firm the straps are."""
+    person = simulate_person(24000, PEOPLE_MEASURED_STD)
+    firm = replace(PEOPLE_PRESET, mount="any", tissue_gain=0.3, tissue_random=0.3, sway=0.3, clock_offset=0.0)
+    recording = simulate(person.lengths, seed=24000, imperfections=firm, circles=0).recording()
+    assert calibrate(recording, measured=person.measured, prior=person.prior).rms_gap < 0.045

@@ -53,21 +53,24 @@ class _Block(NamedTuple):
     span: slice  # of samples
     columns: slice  # of residuals
     contact: np.ndarray  # (n,) of these samples; 1 for hinges
+    least_variance: float
 
     def measure(self, residuals: np.ndarray, least: float) -> tuple[float, float]:
         """Return the variance of residuals (n, k), and of how many samples one is independent, at least `least`."""
         r = residuals[self.span, self.columns]
         variance = float(self.contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(self.contact.sum()))
-        return max(variance, LEAST_VARIANCE), count_correlated_samples(r * self.contact[:, None], least)
+        return max(variance, self.least_variance), count_correlated_samples(r * self.contact[:, None], least)
 
 
 def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool = True) -> list[_Block]:
     blocks = []
     for condition, span in observations.spans():
         if isinstance(condition, Loop):
-            blocks.append(_Block(span, slice(condition.closure.rows), contact[span]))
+            blocks.append(_Block(span, slice(condition.closure.rows), contact[span], LEAST_VARIANCE))
             if observations.layout.hinges and hinges:
-                blocks.append(_Block(span, slice(GAP_ROWS, None), np.ones(span.stop - span.start)))
+                # However well an elbow's axis fits this motion: what it leaves a hinge by follows the pose.
+                every = np.ones(span.stop - span.start)
+                blocks.append(_Block(span, slice(GAP_ROWS, None), every, (ELBOW_STD / HINGE_STD) ** 2))
     return [block for block in blocks if block.contact.sum() > 0.0]
 
 
