@@ -31,7 +31,7 @@ from wepose_pin.body.kinematics import Pose
 from wepose_pin.commands import main
 from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, command_json
 from wepose_pin.live.state import LivePose, StreamInfo
-from wepose_pin.retargeting.approach import APPROACH_SPEED
+from wepose_pin.retargeting.stream import APPROACH_SPEED
 from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 

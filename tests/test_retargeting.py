@@ -208,7 +208,7 @@ def test_five_seconds_out_of_reach(arm, swung: retargeting.Trajectory) -> None:
     target = trajectory.targets[0]
     outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
     assert outside[trajectory.approach_samples :].mean() > 0.3
-    why = retargeting.attribute_errors(trajectory, 0)
+    why = summarized(trajectory)["error_attribution"]
     assert why["beyond the reach"] == pytest.approx(outside[trajectory.approach_samples :].mean(), abs=0.1)
     settled = (trajectory.recorded_time > 5.5) & (trajectory.recorded_time < 7.5)
     assert np.abs(trajectory.run.joint_velocity[settled]).max() < 0.02  # still at the reach: it does not shake
@@ -263,7 +263,7 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     is_sound(trajectory)
     assert error(trajectory)[-1] > 0.05  # it could not get there
     assert trajectory.run.report.near_contact.any()
-    why = retargeting.attribute_errors(trajectory, 0)
+    why = summarized(trajectory)["error_attribution"]
     assert why["self-collision"] > 0.2
     assert why["self-collision"] > 0.9 * sum(why.values())
 

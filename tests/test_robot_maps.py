@@ -123,7 +123,7 @@ def test_the_page_has_the_keys_that_are_tested() -> None:
             "[limits.position]\nyaw = [1.0, -1.0]\n[rest]",
             r"limits.position.yaw = \[1.0, -1.0\]; \[lower, upper\]",
         ),
-        ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; no URDF holds it"),
+        ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; a number above 0"),
         ("[rest]", "[rest", "not valid TOML"),
     ],
 )
@@ -176,5 +176,5 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(errors.BadModel, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"):
         load(urdf)
     urdf.with_suffix(".toml").unlink()
-    with pytest.raises(errors.MissingFile, match=r"no arm.toml beside it; a map says which links"):
+    with pytest.raises(errors.MissingFile, match=r"no arm.toml beside it; a robot needs a map"):
         retargeting.find_map(str(urdf))

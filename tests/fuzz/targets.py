@@ -177,9 +177,9 @@ def _retargeted(path: Path) -> object:
 
 
 def _srdf(path: Path) -> object:
-    from wepose_pin.retargeting.collision import _read_disabled_pairs
+    from wepose_pin.retargeting.collision import read_disabled_pairs
 
-    return _read_disabled_pairs(path)
+    return read_disabled_pairs(path)
 
 
 def _protocol(path: Path) -> object:

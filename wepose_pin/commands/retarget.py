@@ -108,7 +108,7 @@ def retarget(
 
     check_selection(interval, phase)
     check_scale_and_smoothing(scale, smoothing_hz)
-    retargeting.LimitMargins(speed_scale, limit_margin).check()
+    retargeting.LimitMargins(speed_scale, limit_margin)  # refuses what is out of range
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
             progress("reading", 0.0)

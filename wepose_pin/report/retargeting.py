@@ -10,7 +10,7 @@ import numpy as np
 from ..diagnostics import from_json
 from ..retargeting import Trajectory
 from ..retargeting.collision import CLEARANCE, NEAR
-from ..retargeting.error_attribution import CAUSES, FAR, find_error_causes
+from ..retargeting.files import CAUSES, FAR, find_error_causes
 from .figures import (
     ALARM,
     COLOURS,

@@ -6,8 +6,7 @@ coordinates in T to B. `u` holds the values of the joints of the arms, `q` is Pi
 
 from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisions
 from .controller import ControllerParams
-from .error_attribution import MissedTarget, attribute_errors, find_missed_targets
-from .files import build_table, summarize, write_trajectory
+from .files import build_table, find_missed_targets, summarize, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_joint_limits, read_map
 from .robot import LimitMargins, Robot, load_robot
 from .stream import ArmObserver, Command, CommandStream, StreamOptions
@@ -23,13 +22,11 @@ __all__ = [
     "ControllerParams",
     "LimitCheck",
     "LimitMargins",
-    "MissedTarget",
     "Robot",
     "RobotMap",
     "SelfCollisions",
     "StreamOptions",
     "Trajectory",
-    "attribute_errors",
     "build_table",
     "check_limits",
     "compute_arm_targets",

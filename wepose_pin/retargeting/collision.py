@@ -71,7 +71,10 @@ class CollisionModel:
         radius = np.array([shape.geometry.aabb_radius for shape in objects])
         self._first, self._second = (np.array([pair[k] for pair in self.pairs], dtype=int) for k in (0, 1))
         self._range = radius[self._first] + radius[self._second] + NEAR
-        self._supports = _find_supporting_joints(robot.model)
+        self._supports = np.zeros((robot.model.njoints, robot.model.nv))  # 1: the joint moves by that velocity
+        for joint in range(1, robot.model.njoints):
+            self._supports[joint] = self._supports[robot.model.parents[joint]]
+            self._supports[joint, robot.model.idx_vs[joint]] = 1.0
         # Hulls closer than the clearance in the rest posture keep half of their distance there, or their overlap.
         rest = self._measure(robot.rest, np.arange(len(self.pairs)))
         self.clearance = np.minimum(CLEARANCE, np.where(rest > 0.0, 0.5 * rest, rest))
@@ -261,7 +264,7 @@ def select_pairs(robot: Robot) -> list[tuple[int, int]]:
     shapes.addAllCollisionPairs()  # of different parts
     names = [shape.name for shape in shapes.geometryObjects]
     links = [name.rpartition("_")[0] for name in names]  # Pinocchio names a shape after its link: LINK_0, LINK_1, …
-    disabled = set() if robot.map.srdf is None else _read_disabled_pairs(robot.map.srdf)
+    disabled = set() if robot.map.srdf is None else read_disabled_pairs(robot.map.srdf)
     adjacent = _find_adjacent_links(robot.full, set(links))
     data, q = shapes.createData(), robot.configuration(robot.rest)
     pin.computeCollisions(robot.model, robot.model.createData(), shapes, data, q, False)
@@ -294,16 +297,14 @@ def _leave_out_always_and_never(robot: Robot, pairs: list[tuple[int, int]]) -> l
         u = np.where(rng.random(n) < _END_SHARE, at_end, rng.uniform(*ends))
         pin.computeCollisions(robot.model, data, shapes, geometry, robot.configuration(u), False)
         hits += [result.isCollision() for result in geometry.collisionResults]
-    joints = [shape.parentJoint for shape in shapes.geometryObjects]
-    near = [_are_few_joints_apart(robot.model, *sorted((joints[i], joints[j]))) for i, j in pairs]
-    kept = (hits < _ALWAYS * samples) & ((hits > 0) | ~np.array(near))
-    return [pair for pair, keep in zip(pairs, kept, strict=True) if keep]
-
-
-def _are_few_joints_apart(model: Any, a: int, b: int) -> bool:
-    for _ in range(_FEW_JOINTS):
-        b = model.parents[b] if b > a else b
-    return b == a
+    kept = []
+    for (i, j), count in zip(pairs, hits.tolist(), strict=True):
+        first, last = sorted(shapes.geometryObjects[k].parentJoint for k in (i, j))
+        for _ in range(_FEW_JOINTS):  # towards the root
+            last = robot.model.parents[last] if last > first else last
+        if count < _ALWAYS * samples and (count > 0 or last != first):
+            kept.append((i, j))
+    return kept
 
 
 def _find_adjacent_links(full: Any, shaped: set[str]) -> set[frozenset[str]]:
@@ -328,18 +329,10 @@ def _find_adjacent_links(full: Any, shaped: set[str]) -> set[frozenset[str]]:
     return pairs
 
 
-def _read_disabled_pairs(srdf: Path) -> set[frozenset[str]]:
+def read_disabled_pairs(srdf: Path) -> set[frozenset[str]]:
+    """Read the pairs of links that an SRDF leaves out of collisions."""
     try:
         root = ElementTree.parse(srdf).getroot()
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise BadModel(f"{srdf}: not valid XML: {error}") from error
     return {frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in root.iter("disable_collisions")}
-
-
-def _find_supporting_joints(model: Any) -> np.ndarray:
-    """(njoints, nv): 1 where the placement of a joint depends on a velocity."""
-    supports = np.zeros((model.njoints, model.nv))
-    for joint in range(1, model.njoints):
-        supports[joint] = supports[model.parents[joint]]
-        supports[joint, model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = 1.0
-    return supports

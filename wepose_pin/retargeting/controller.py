@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..arguments import NonNegative
+from ..compilation import compiled
 from ..errors import WeposeError, how_to_install
 from .collision import NEAR, CollisionModel, NearPairs
 from .limits import (
@@ -29,7 +30,6 @@ from .limits import (
     compute_stop,
     reduce_acceleration_limits,
 )
-from .objective import add_arm_tasks
 from .robot import Arm, Robot
 from .targets import HandTarget
 
@@ -40,6 +40,12 @@ _DAQP_INFINITY = 1e30  # a bound that daqp ignores
 _DAQP_SOFT = 8  # a constraint that may be violated, by as little as possible
 _DAQP_SOLVED = (1, 2)  # flags: all constraints kept, or all but soft ones
 _NO_JACOBIAN = np.empty((0, 0))
+# Places of the parameters of `ControllerParams` in the array that the kernels get.
+POSITION, ORIENTATION, SWIVEL, GAIN, DECELERATION, SINGULAR_BELOW, DAMPING, CURVATURE = range(8)
+_MIN_SWIVEL = 0.01  # [m] below it the elbow has no swivel direction
+_FULL_SWIVEL = 0.05  # [m] above it the swivel task has its full weight
+_MAX_SWIVEL_RATE = 3.0  # [rad/s] of its correction
+_LEVER = 0.2  # [m] from a joint to the hand, for the curvature of the hand's path
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class ControllerParams:
     """Weights of the squared errors of the tasks, gains, and damping.
 
     A weight w counts an error e as √w e, against a hand's velocity error of 1 m/s with the weight 1. The first eight
-    are those of `objective`, in its order.
+    are those of `_add_arm_tasks`, in its order.
     """
 
     position: NonNegative = 1.0  # velocity of a hand [m/s]
@@ -98,13 +104,6 @@ class JointState(NamedTuple):
         return not (self.velocity.any() or self.acceleration.any())
 
 
-class PostureReference(NamedTuple):
-    """Posture that joints tend to which the hands leave free."""
-
-    position: np.ndarray  # (n,) [rad or m]
-    velocity: np.ndarray | float  # (n,) [rad/s or m/s]; 0.0: at rest
-
-
 @dataclass
 class QpController:
     """Steps the robot towards its targets, inside its limits."""
@@ -115,7 +114,7 @@ class QpController:
     params: ControllerParams = field(default_factory=ControllerParams)  # weights, gains, damping
     limit_factor: float = 1.0  # widens the limits of velocity, acceleration and jerk
     guarded: bool = True  # takes only steps from which the robot can stop without self-contact
-    posture_reference: PostureReference | None = None  # replaces the rest posture
+    posture_reference: tuple[np.ndarray, np.ndarray] | None = None  # position and velocity (n,), in place of the rest
     report: StepReport = field(init=False)  # of the last step
 
     def __post_init__(self) -> None:
@@ -156,10 +155,10 @@ class QpController:
         H, f = np.zeros((n, n)), np.zeros(n)
         for arm, target in zip(self._arms, targets, strict=True):
             arm.add_to_objective(H, f, target, self._task_params, dt, state.velocity)
-        reference = self.posture_reference or PostureReference(self.robot.rest, 0.0)
+        posture, posture_rate = self.posture_reference or (self.robot.rest, np.zeros(n))
         velocity_mid = state.velocity + 0.5 * dt * state.acceleration  # half a step on, already determined
         H.flat[:: n + 1] += params.posture + params.joint_velocity + params.joint_velocity_change
-        f += params.posture * (params.posture_gain * (reference.position - state.position) + reference.velocity)
+        f += params.posture * (params.posture_gain * (posture - state.position) + posture_rate)
         f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)
         compute_acceleration_bounds(*state, *self._limits, dt, *self._bounds)
         w_min, w_max = (velocity_mid + dt * bound for bound in self._bounds)
@@ -234,8 +233,7 @@ class QpController:
         return JointState(*self._stop[0]) if len(self._stop) else JointState.at_rest(state.position)
 
     def _take_stop(self, state: JointState) -> JointState:
-        after = self._find_next_of_stop(state)
-        self._stop = self._stop[1:]
+        after, self._stop = self._find_next_of_stop(state), self._stop[1:]
         return after
 
     def _report_step(self, near: NearPairs, stopping: bool) -> None:
@@ -290,8 +288,90 @@ class _ArmTasks:
         J_hand = J * self._frames[0][4]
         J_elbow = J * self._frames[1][4] if self._has_swivel else _NO_JACOBIAN
         rotation_error = pin.log3(target.rotation @ self.pose.rotation.T)
-        add_arm_tasks(
+        _add_arm_tasks(
             H, f, J_hand, J_elbow, self.pose.hand, self.pose.elbow, self.arm.shoulder, rotation_error,
             target.position, target.velocity, target.angular_velocity, target.swivel, float(target.weight), v, dt,
             params, self.arm.joints,
         )  # fmt: skip
+
+
+@compiled
+def _add_arm_tasks(  # type: ignore[no-untyped-def]
+    H, f, J_hand, J_elbow, hand, elbow, shoulder, rotation_error, position, velocity, angular_velocity, swivel, weight,
+    v, dt, tasks, joints,
+):  # fmt: skip
+    """Add one arm's tasks to ½ wᵀ H w − fᵀ w.
+
+    Parameters
+    ----------
+    H, f : (n, n), (n,), changed in place
+    J_hand, J_elbow : (6, n) of what the hand's, the elbow's joint carries, at the origin of B: linear [m/s] over
+        angular [rad/s]; `J_elbow` is (0, 0) for an arm without a swivel task
+    hand, elbow, shoulder : (3,) [m] in B
+    rotation_error : (3,) [rad] from the hand's orientation to its target
+    position, velocity, angular_velocity, swivel, weight : of `HandTarget`
+    v : (n,) joint velocities
+    joints : (k,) of the arm
+    """
+    linear, angular = _compute_point_jacobian(J_hand, hand), J_hand[3:]
+    # Half of the coming step is already decided.
+    distance, rotation = position - hand - 0.5 * dt * (linear @ v), rotation_error - 0.5 * dt * (angular @ v)
+    weight_p, weight_R = tasks[POSITION] * weight, tasks[ORIENTATION] * weight
+    H += weight_p * (linear.T @ linear) + weight_R * (angular.T @ angular)
+    f += weight_p * (linear.T @ _correct_error(distance, velocity, tasks))
+    f += weight_R * (angular.T @ _correct_error(rotation, angular_velocity, tasks))
+    if J_elbow.shape[0]:
+        _add_swivel_task(H, f, linear, J_elbow, hand, elbow, shoulder, swivel, weight, tasks)
+    # The derivative of the Jacobian in the Hessian: where an arm is straight and its target farther away, the only term
+    # that keeps the elbow from swinging through (Levenberg; Sugihara 2011 weighs it by the error too).
+    curvature = weight_p * _LEVER * np.sqrt(distance @ distance) + weight_R * np.sqrt(rotation @ rotation)
+    for j in joints:
+        H[j, j] += tasks[CURVATURE] * curvature
+    least = np.sqrt(max(np.linalg.eigvalsh(linear @ linear.T)[0], 0.0))
+    if least >= tasks[SINGULAR_BELOW]:
+        return
+    damping = tasks[DAMPING] * (1.0 - least / tasks[SINGULAR_BELOW]) ** 2  # Nakamura and Hanafusa 1986
+    for j in joints:
+        H[j, j] += damping
+        f[j] += 0.9 * damping * v[j]
+
+
+@compiled
+def _compute_point_jacobian(J, p):  # type: ignore[no-untyped-def]
+    """Linear Jacobian (3, n) of the point `p` (3,) of a body, from `J` (6, n) at the origin."""
+    linear = J[:3].copy()
+    linear[0] += J[4] * p[2] - J[5] * p[1]
+    linear[1] += J[5] * p[0] - J[3] * p[2]
+    linear[2] += J[3] * p[1] - J[4] * p[0]
+    return linear
+
+
+@compiled
+def _correct_error(error, feedforward, tasks):  # type: ignore[no-untyped-def]
+    """Velocity (3,): the feedforward, and a correction that `DECELERATION` can stop within the error."""
+    size, gain = np.sqrt(error @ error), tasks[GAIN]
+    if size > 0.0:
+        gain = min(gain, np.sqrt(2.0 * tasks[DECELERATION] / size))
+    return feedforward + gain * error
+
+
+@compiled
+def _add_swivel_task(H, f, linear, J_elbow, hand, elbow, shoulder, swivel, weight, tasks):  # type: ignore[no-untyped-def]
+    """Rotate the elbow about the line shoulder-hand to the person's; the task fades where either arm is straight."""
+    offset, upper = hand - shoulder, elbow - shoulder
+    far = np.sqrt(offset @ offset)
+    if far < _FULL_SWIVEL:
+        return
+    axis = offset / far
+    along = upper @ axis
+    own, wanted = upper - along * axis, swivel - (swivel @ axis) * axis
+    radius, size = np.sqrt(own @ own), np.sqrt(wanted @ wanted)
+    if radius < _MIN_SWIVEL or size < _MIN_SWIVEL:
+        return
+    tangent = np.cross(axis, own) / radius
+    angle = np.arctan2(wanted @ tangent, wanted @ own / radius)
+    rate = min(max(0.5 * tasks[GAIN] * angle, -_MAX_SWIVEL_RATE), _MAX_SWIVEL_RATE)
+    w = tasks[SWIVEL] * weight * min(1.0, size / _FULL_SWIVEL) * min(1.0, radius / _FULL_SWIVEL)
+    row = tangent @ (_compute_point_jacobian(J_elbow, elbow) - along / far * linear)
+    H += w * np.outer(row, row)
+    f += w * radius * rate * row

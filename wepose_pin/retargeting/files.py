@@ -1,30 +1,190 @@
-"""Files of a trajectory: tables, ROS 2's message, the robot, the summary; and what writers of other formats take."""
+"""What came of a trajectory: errors of the hands and their causes, diagnostics, the summary, and the files."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from ..body.urdf import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..recording import format_span
+from ..recording.gaps import find_runs
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
 from .checks import LimitCheck, SelfCollisions
-from .collision import CLEARANCE
-from .error_attribution import CLAMPED, LOST_M, MissedTarget, attribute_errors, find_missed_targets
 from .placement import place_root
-from .targets import compute_target_reach
 from .trajectory import Trajectory
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names
 MIN_SWIVEL = 0.03  # [m] from the line shoulder-hand to the elbow, below which the swivel error is undefined
+FAR = 0.02  # [m] off the target: above it the error is attributed
+CLAMPED = 1e-3  # [m] by which a target was moved: it was outside the reach
+AT_LIMIT = 0.01  # [rad or m] from a position limit: there an active joint is at its position limit
+CATCH_UP_S = 0.3  # [s] after a joint was too slow in which its error is attributed to that
+CAUSES = ("not measured", "beyond the reach", "self-collision", "joint limit", "too fast", "conflicting tasks")
+LOST_M, LOST_S = 0.05, 1.0  # a hand is lost that is farther off for longer
+MIN_WEIGHT = 0.5  # of a hand; where its target is more uncertain, its error does not count
+
+
+def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
+    """Return the cause (n,) of the error of a hand, its place in `CAUSES`; -1 where the hand is less than `FAR` off.
+
+    The first that applies: a sensor was lost; the target is beyond the reach; links close to each other stop the arm; a
+    joint is at its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before;
+    none of these: position, orientation and swivel cannot be met together.
+    """
+    robot, run = trajectory.robot, trajectory.run
+    joints, target = robot.arms[arm].joints, trajectory.targets[arm]
+    u = run.joint_position[:, joints]
+    at_limit = (u - robot.lower[joints] < AT_LIMIT) | (robot.upper[joints] - u < AT_LIMIT)
+    active, half = run.report.limited[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
+    applies = [
+        target.lost,
+        np.linalg.norm(target.position - target.unclamped, axis=1) > CLAMPED,
+        run.report.near_contact[:, joints].any(axis=1),
+        (active & at_limit).any(axis=1),
+        maximum_filter1d(active.any(axis=1), 2 * half + 1, origin=half),
+        np.ones(len(u), dtype=bool),
+    ]
+    far = np.linalg.norm(run.hand[arm] - target.unclamped, axis=1) > FAR
+    return np.where(far, np.argmax(applies, axis=0), -1)
+
+
+class MissedTarget(NamedTuple):
+    """A time in which a hand stays off its target."""
+
+    side: str
+    span: tuple[float, float]  # [s] of the recording
+    error: float  # [m] largest
+
+
+def find_missed_targets(trajectory: Trajectory) -> list[MissedTarget]:
+    """Return when a hand is off by more than `LOST_M` for longer than `LOST_S`."""
+    missed, least = [], round(LOST_S / float(trajectory.time[1]))
+    for arm, target, hand in zip(trajectory.robot.arms, trajectory.targets, trajectory.run.hand, strict=True):
+        distance = np.linalg.norm(hand - target.position, axis=1)
+        lost = (distance > LOST_M) & (target.weight >= MIN_WEIGHT) & ~target.lost
+        lost[: trajectory.approach_samples] = False
+        for first, end in find_runs(lost) if trajectory.params.position else ():
+            if end - first >= least:
+                begin_s, end_s = trajectory.recorded_time[[first, end - 1]].tolist()
+                missed.append(MissedTarget(arm.side, (begin_s, end_s), float(distance[first:end].max())))
+    return missed
+
+
+def diagnose_trajectory(
+    trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions, slowdown: float | None = None
+) -> list[Diagnostic]:
+    """Diagnostics of a trajectory; `slowdown`: its duration over that of the recording."""
+    name = trajectory.robot.map.name
+    diagnostics = []
+    for quantity in ("position", "velocity", "acceleration", "jerk"):
+        margin = getattr(limits, quantity)
+        if margin < 0.0:
+            facts = {"quantity": quantity} | ({"variant": "position"} if quantity == "position" else {})
+            diagnostics.append(Diagnostic("robot-limits-exceeded", ERROR, name, -margin, 0.0, facts))
+    if not (limits.consistent and limits.ends_at_rest):
+        diagnostics.append(Diagnostic("robot-limits-exceeded", ERROR, name, facts={"variant": "curve"}))
+    if collisions.samples:
+        first = {"first": collisions.first}
+        diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
+    if not collisions.pairs:
+        diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name))
+    missed = find_missed_targets(trajectory)
+    for side in dict.fromkeys(target.side for target in missed):
+        own = [target for target in missed if target.side == side]
+        moments = ", ".join(format_span(target.span) for target in own[:MAX_MOMENTS])
+        error = max(target.error for target in own)
+        diagnostics.append(Diagnostic("robot-hand-off-target", WARNING, side, error, LOST_M, {"moments": moments}))
+    if (limiting := trajectory.limiting_joint) is not None and slowdown is not None:
+        about: dict[str, float | str] = {"joint": limiting.joint, "quantity": limiting.quantity}
+        about["moment"] = limiting.time
+        diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=about))
+    if stopping := int(trajectory.run.report.stopping.sum()):
+        diagnostics.append(Diagnostic("robot-stopped-for-clearance", WARNING, name, stopping))
+    return diagnostics
+
+
+def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
+    """Contents of ``summary.json``."""
+    robot, run, limiting = trajectory.robot, trajectory.run, trajectory.limiting_joint
+    begin = trajectory.approach_samples
+    recorded_s = float(trajectory.recorded_time[-1] - trajectory.recorded_time[begin])
+    shown_s = float(trajectory.time[np.argmax(trajectory.recorded_time)] - trajectory.time[begin])
+    slowdown = round(shown_s / recorded_s, 3) if recorded_s else None
+    nearest = float(run.report.hull_distance.min())
+    R_WB, p_WB = place_root(robot)
+    root = (*p_WB.tolist(), *Rotation.from_matrix(R_WB).as_quat().tolist())
+    return {
+        "robot": robot.map.name,
+        "urdf": robot.map.urdf.name,
+        "joints": list(robot.names),
+        "posture": robot.posture,
+        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), root, strict=True)),
+        "description": robot.map.description,
+        "rate_hz": round(1.0 / float(trajectory.time[1]), 3),
+        "duration_s": round(float(trajectory.time[-1]), 3),
+        "approach_s": round(float(trajectory.time[begin]), 3),
+        "recorded_s": round(recorded_s, 3),
+        "slowdown": slowdown,
+        "slowest": None if limiting is None else limiting._asdict(),
+        "arms": {arm.side: _summarize_arm(trajectory, i) for i, arm in enumerate(robot.arms)},
+        "within_limits": limits.passed,
+        "limit_margins": {
+            "position_rad": limits.position,
+            "velocity_share": limits.velocity,
+            "acceleration_share": limits.acceleration,
+            "jerk_share": limits.jerk,
+        },
+        "self_collisions": {
+            "samples": collisions.samples,
+            "first": collisions.first or None,
+            "pairs": collisions.pairs,
+            "min_hull_distance_mm": round(1e3 * nearest, 1) if np.isfinite(nearest) else None,
+        },
+        "steps": {"stopping_share": _share(run.report.stopping)},
+        "diagnostics": [as_json(each) for each in diagnose_trajectory(trajectory, limits, collisions, slowdown)],
+    }
+
+
+def _summarize_arm(trajectory: Trajectory, i: int) -> dict[str, Any]:
+    """Errors of one arm after the approach."""
+    arm, target, run = trajectory.robot.arms[i], trajectory.targets[i], trajectory.run
+    moving = slice(trajectory.approach_samples, None)
+    inside = np.linalg.norm(target.position - target.unclamped, axis=1)[moving] < CLAMPED
+    far = 1e3 * np.linalg.norm(run.hand[i] - target.unclamped, axis=1)[moving]
+    turn = Rotation.from_matrix(run.rotation[i, moving]).inv() * Rotation.from_matrix(target.rotation[moving])
+    swivels = run.swivel[i, moving], target.swivel[moving]
+    sizes = [np.linalg.norm(swivel, axis=1) for swivel in swivels]
+    flexed = np.min(sizes, axis=0) > MIN_SWIVEL
+    cosine = np.sum(swivels[0] * swivels[1], axis=1)[flexed] / (sizes[0] * sizes[1])[flexed]
+    cause = find_error_causes(trajectory, i)[moving]
+    return {
+        "scale": round(trajectory.arm_targets.scale[arm.side], 4),
+        "inside_reach_share": _share(inside),
+        "hand_error_mm": _quantiles(far[inside]),
+        "hand_error_everywhere_mm": _quantiles(far),
+        "error_attribution": {name: _share(cause == k) for k, name in enumerate(CAUSES)},
+        "hand_error_deg": _quantiles(np.degrees(turn.magnitude())),
+        "swivel_error_deg": _quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+    }
+
+
+def _quantiles(values: np.ndarray) -> dict[str, float] | None:
+    if not len(values):
+        return None
+    return {name: round(float(np.percentile(values, q)), 2) for name, q in (("median", 50), ("p90", 90), ("p99", 99))}
+
+
+def _share(mask: np.ndarray) -> float:
+    return round(float(np.mean(mask)), 4)
 
 
 def build_table(trajectory: Trajectory) -> pl.DataFrame:
@@ -50,8 +210,8 @@ def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
 
 
 def _format_joint_trajectory(trajectory: Trajectory) -> str:
-    """ROS 2's trajectory_msgs/msg/JointTrajectory."""
-    rows, run = [], trajectory.run
+    """ROS 2's trajectory_msgs/msg/JointTrajectory, a line a point."""
+    run, points = trajectory.run, []
     for k, time in enumerate(trajectory.time.tolist()):
         seconds, nanoseconds = divmod(round(1e9 * time), 10**9)
         point = {
@@ -61,140 +221,10 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
             "effort": [],
             "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
         }
-        rows.append(json.dumps(point, separators=(", ", ": ")))
+        points.append(json.dumps(point))
     head = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    points = ",\n".join(rows)
+    lines = ",\n".join(points)
     return (
         f'{{"header": {json.dumps(head)},\n"joint_names": {json.dumps(list(trajectory.robot.names))},\n'
-        f'"points": [\n{points}\n]}}\n'
+        f'"points": [\n{lines}\n]}}\n'
     )
-
-
-def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
-    """Contents of ``summary.json``."""
-    robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
-    arms = {arm.side: _summarize_arm(trajectory, i) for i, arm in enumerate(robot.arms)}
-    dt = float(trajectory.time[1] - trajectory.time[0])
-    recorded_time, limiting = trajectory.recorded_time, trajectory.limiting_joint
-    recorded_s = float(recorded_time[-1] - recorded_time[begin])
-    shown_s = float(trajectory.time[np.argmax(recorded_time)] - trajectory.time[begin])
-    slowdown = shown_s / recorded_s if recorded_s else None
-    nearest = float(run.report.hull_distance.min())
-    missed = find_missed_targets(trajectory)
-    R_WB, p_WB = place_root(robot)
-    root = (*p_WB.tolist(), *Rotation.from_matrix(R_WB).as_quat().tolist())
-    return {
-        "robot": robot.map.name,
-        "urdf": robot.map.urdf.name,
-        "joints": list(robot.names),
-        "posture": robot.posture,
-        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), root, strict=True)),
-        "description": robot.map.description,
-        "rate_hz": round(1.0 / dt, 3),
-        "duration_s": round(float(trajectory.time[-1]), 3),
-        "approach_s": round(float(trajectory.time[begin]), 3),
-        "recorded_s": round(recorded_s, 3),
-        "slowdown": None if slowdown is None else round(slowdown, 3),
-        "slowest": None if limiting is None else limiting._asdict(),
-        "contact_times_s": trajectory.contact_times,
-        "missed_targets": [target._asdict() for target in missed],
-        "arms": arms,
-        "within_limits": limits.passed,
-        "speed_scale": robot.margins.speed_scale,
-        "limit_margin_rad": robot.margins.limit_margin,
-        "limit_margins": {
-            "position_rad": limits.position,
-            "velocity_share": limits.velocity,
-            "acceleration_share": limits.acceleration,
-            "jerk_share": limits.jerk,
-        },
-        "self_collisions": {
-            "samples": collisions.samples,
-            "first": collisions.first or None,
-            "pairs": collisions.pairs,
-            "min_hull_distance_mm": round(1e3 * nearest, 1) if np.isfinite(nearest) else None,
-            "clearance_mm": 1e3 * CLEARANCE,
-        },
-        "steps": {
-            "all": len(trajectory.time),
-            "stopping_share": _share(run.report.stopping),
-        },
-        "diagnostics": [
-            as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, missed, slowdown)
-        ],
-    }
-
-
-def _summarize_arm(trajectory: Trajectory, i: int) -> dict[str, Any]:
-    """One arm's errors."""
-    robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
-    arm, target = robot.arms[i], trajectory.targets[i]
-    inside = np.linalg.norm(target.position - target.unclamped, axis=1)[begin:] < CLAMPED
-    far = 1e3 * np.linalg.norm(run.hand[i] - target.unclamped, axis=1)[begin:]
-    error = Rotation.from_matrix(run.rotation[i, begin:]).inv() * Rotation.from_matrix(target.rotation[begin:])
-    swivel, wanted = run.swivel[i, begin:], target.swivel[begin:]
-    size, wanted_size = np.linalg.norm(swivel, axis=1), np.linalg.norm(wanted, axis=1)
-    flexed = (size > MIN_SWIVEL) & (wanted_size > MIN_SWIVEL)
-    cosine = np.sum(swivel[flexed] * wanted[flexed], axis=1) / (size[flexed] * wanted_size[flexed])
-    return {
-        "scale": round(trajectory.arm_targets.scale[arm.side], 4),
-        "reach_m": round(compute_target_reach(robot, arm), 4),
-        "farthest_reach_m": round(arm.reach, 4),
-        "inside_reach_share": _share(inside),
-        "hand_error_mm": _quantiles(far[inside]),
-        "hand_error_everywhere_mm": _quantiles(far),
-        "error_attribution": attribute_errors(trajectory, i),
-        "hand_error_deg": _quantiles(np.degrees(error.magnitude())),
-        "swivel_error_deg": _quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
-        "lost_share": _share(target.lost[begin:]),
-    }
-
-
-def diagnose_trajectory(
-    trajectory: Trajectory,
-    limits: LimitCheck,
-    collisions: SelfCollisions,
-    missed: list[MissedTarget],
-    slowdown: float | None = None,
-) -> list[Diagnostic]:
-    """Diagnostics of a trajectory; `slowdown`: its duration over that of the recording."""
-    name = trajectory.robot.map.name
-    diagnostics = []
-    for quantity in ("position", "velocity", "acceleration", "jerk"):
-        margin = getattr(limits, quantity)
-        if margin < 0.0:
-            facts = {"quantity": quantity} | ({"variant": "position"} if quantity == "position" else {})
-            diagnostics.append(Diagnostic("robot-limits-exceeded", ERROR, name, -margin, 0.0, facts))
-    if not (limits.consistent and limits.ends_at_rest):
-        diagnostics.append(Diagnostic("robot-limits-exceeded", ERROR, name, facts={"variant": "curve"}))
-    if collisions.samples:
-        first = {"first": collisions.first}
-        diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
-    if not collisions.pairs:
-        diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name))
-    for side in dict.fromkeys(target.side for target in missed):
-        spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
-        error = max(target.error for target in missed if target.side == side)
-        moments = ", ".join(spans[:MAX_MOMENTS])
-        diagnostics.append(Diagnostic("robot-hand-off-target", WARNING, side, error, LOST_M, {"moments": moments}))
-    limiting = trajectory.limiting_joint
-    if limiting is not None and slowdown is not None:
-        moment: dict[str, float | str] = {
-            "joint": limiting.joint,
-            "moment": limiting.time,
-            "quantity": limiting.quantity,
-        }
-        diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
-    if stopping := int(trajectory.run.report.stopping.sum()):
-        diagnostics.append(Diagnostic("robot-stopped-for-clearance", WARNING, name, stopping))
-    return diagnostics
-
-
-def _quantiles(values: np.ndarray) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    return {name: round(float(np.percentile(values, q)), 2) for name, q in (("median", 50), ("p90", 90), ("p99", 99))}
-
-
-def _share(mask: np.ndarray) -> float:
-    return round(float(np.mean(mask)), 4)

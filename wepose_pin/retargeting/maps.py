@@ -33,9 +33,9 @@ class JointLimit(NamedTuple):
 
 
 def read_joint_limits(path: Path) -> dict[str, JointLimit]:
-    """Limits of every movable joint of a URDF; NaN where it has none.
+    """Read the limits of every movable joint of a URDF, without Pinocchio; zero where it has none.
 
-    Read without Pinocchio, so that a check against them shares no code with the controller.
+    So a check against them shares no code with the controller.
 
     Raises
     ------
@@ -44,17 +44,13 @@ def read_joint_limits(path: Path) -> dict[str, JointLimit]:
     """
     limits = {}
     for joint in read_urdf(path).joints:
-        if joint.type not in ("revolute", "continuous", "prismatic"):
-            continue
-        limit, mimic = joint.limit, joint.mimic
-        if limit is None:
-            lower, upper, velocity = np.nan, np.nan, np.nan
-        else:  # an attribute that is left out is zero
-            lower, upper, velocity = limit.lower or 0.0, limit.upper or 0.0, limit.velocity or 0.0
-        if joint.type == "continuous":
-            lower, upper = -np.inf, np.inf
-        source = None if mimic is None else (mimic.joint, mimic.multiplier, mimic.offset)
-        limits[joint.name] = JointLimit(joint.type, lower, upper, velocity, source)
+        if joint.type in ("revolute", "continuous", "prismatic"):
+            limit, mimic = joint.limit, joint.mimic
+            lower, upper, velocity = (getattr(limit, key, 0.0) or 0.0 for key in ("lower", "upper", "velocity"))
+            if joint.type == "continuous":
+                lower, upper = -np.inf, np.inf
+            source = None if mimic is None else (mimic.joint, mimic.multiplier, mimic.offset)
+            limits[joint.name] = JointLimit(joint.type, lower, upper, velocity, source)
     return limits
 
 
@@ -155,7 +151,7 @@ class RobotMap:
 
 
 def find_map(robot: str) -> RobotMap:
-    """The map of a robot by name, by its URDF with a map of the same name beside it, or by the map's file.
+    """Find the map of a robot by name, by its URDF with a map of the same name beside it, or by the map's file.
 
     Raises
     ------
@@ -166,14 +162,11 @@ def find_map(robot: str) -> RobotMap:
     if path.suffix.lower() == ".toml":
         return read_map(path)
     if path.suffix.lower() in (".urdf", ".xml"):
+        file = path.with_suffix(".toml")
         if not path.is_file():
             raise MissingFile(f"--robot {robot}: no such file")
-        file = path.with_suffix(".toml")
         if not file.is_file():
-            raise MissingFile(
-                f"--robot {robot}: no {file.name} beside it; a map says which links are shoulder, elbow and hand"
-                " (docs/robot-maps.md)"
-            )
+            raise MissingFile(f"--robot {robot}: no {file.name} beside it; a robot needs a map (docs/robot-maps.md)")
         return read_map(file, urdf=path)
     if robot not in ROBOTS:
         raise BadModel(f"--robot {robot}: not known; {one_of(ROBOTS, robot)}; or a file, FILE.urdf")
@@ -181,13 +174,7 @@ def find_map(robot: str) -> RobotMap:
 
 
 def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
-    """The map in a file; `urdf` replaces the URDF that it names.
-
-    Raises
-    ------
-    MissingFile, BadModel
-        As `find_map`.
-    """
+    """Read the map in a file; `urdf` replaces the URDF that it names. Errors are those of `find_map`."""
     top = TomlTable(read_toml(path, "a robot's map (docs/robot-maps.md)", BadModel), path.name, error=BadModel)
     if top.values.get("format") != 1:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
@@ -228,17 +215,13 @@ def list_sides(arm: str | None) -> tuple[str, ...] | None:
 
 
 def _find_file(path: Path, top: TomlTable, key: str) -> Path:
-    """The file that a map names: beside the map, or in example-robot-data."""
+    """Find the file that a map names: beside the map, or in example-robot-data."""
     name, data = top.values[key], find_example_data()
     for folder in (path.parent, data):
         if folder is not None and (folder / name).is_file():
             return folder / name
-    if data is None and "/" in name:
-        raise MissingFile(
-            f"{top.at(key)} = '{name}' is in example-robot-data, which is not installed; "
-            "pip install --no-deps example-robot-data"
-        )
-    raise MissingFile(f"{top.at(key)} = '{name}': no such file beside the map or in example-robot-data")
+    install = "" if data else ", which is not installed: pip install --no-deps example-robot-data"
+    raise MissingFile(f"{top.at(key)} = '{name}': no such file beside the map or in example-robot-data{install}")
 
 
 def _check_axes(table: TomlTable, first: str, second: str) -> None:
@@ -249,22 +232,19 @@ def _check_axes(table: TomlTable, first: str, second: str) -> None:
 
 
 def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[str, float]:
-    """One number for all joints, or a table with a number for each."""
+    """Read one number for all joints, or a table with a number for each."""
     value = limits.values.get(key, {})
     if is_number(value, MAX_VALUE):
         return dict.fromkeys(joints, float(value))
-    if not isinstance(value, Mapping):
+    if not isinstance(value, Mapping) or not all(is_number(number, MAX_VALUE) for number in value.values()):
         raise BadModel(
             f"{limits.at(key)} = {value!r}; a number for all joints, or a table with one for each, is needed"
         )
-    for name, number in value.items():
-        if not is_number(number, MAX_VALUE):
-            raise BadModel(f"{limits.at(key)}.{name} = {number!r}; a number is needed")
     return {name: float(number) for name, number in value.items()}
 
 
 def _read_ranges(table: TomlTable) -> dict[str, tuple[float, ...]]:
-    """Joint → lower and upper limit."""
+    """Read joint → lower and upper limit."""
     for name, value in table.values.items():
         is_pair = isinstance(value, list) and len(value) == 2 and all(is_number(each, MAX_VALUE) for each in value)
         if not is_pair or not value[0] < value[1]:

@@ -12,7 +12,7 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from ..body.urdf import package_folders
-from ..errors import BadModel, WrongOption, native_stderr_muted, one_of
+from ..errors import BadModel, WrongOption, native_stderr_muted, one_of, reason
 from .maps import AXES, ArmMap, HandPoint, JointLimit, LinkPoint, RobotMap
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
@@ -32,8 +32,7 @@ class LimitMargins:
     speed_scale: float = 0.9  # share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1
     limit_margin: float = 0.05  # [rad] to each position limit; of a joint that slides a tenth of it in metres
 
-    def check(self) -> None:
-        """Raise `WrongOption` for a value out of range."""
+    def __post_init__(self) -> None:
         if not 0.0 < self.speed_scale <= 1.0:
             raise WrongOption("speed-scale", f"{self.speed_scale:g}", "above 0, up to 1, the robot's full limits")
         if not 0.0 <= self.limit_margin < np.pi:
@@ -104,7 +103,7 @@ class Robot:
 
 
 def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: LimitMargins | None = None) -> Robot:
-    """The robot of a map, with the arms of `sides`; None: all arms of the map, the default margins.
+    """Build the robot of a map, with the arms of `sides`; None: all arms of the map, the default margins.
 
     Raises
     ------
@@ -113,7 +112,6 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
         arm that the robot does not have.
     """
     margins = margins or LimitMargins()
-    margins.check()
     for side in sides or ():
         if side not in robot.arms:
             raise WrongOption("arm", side, f"{robot.name} has no {side} arm; {one_of(robot.arms)}")
@@ -123,14 +121,17 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
         with native_stderr_muted():  # urdfdom repeats the exception's text
             full = pin.buildModelFromUrdf(str(robot.urdf))
     except Exception as error:  # what C++ throws
-        raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {_first_line(error)}") from error
+        raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {reason(error)}") from error
     links = {frame.name for frame in full.frames if frame.type == pin.FrameType.BODY}
     for frame in full.frames:  # Pinocchio finds frames by name, and a fixed joint may have that of a link
         if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
             frame.name = f"{frame.name} (fixed joint)"
     _check_map(robot, maps, full, limits)
     rest_full = _build_rest_configuration(robot, full, limits)
-    base = _find_base(robot, full, rest_full)
+    base, data = pin.SE3.Identity(), full.createData()
+    if robot.base:
+        pin.framesForwardKinematics(full, data, rest_full)
+        base = data.oMf[full.getFrameId(robot.base)]
     R_BT = np.asarray(base.rotation @ _build_rotation(AXES[robot.forward], AXES[robot.up]))
     geometry = _load_collision_geometry(robot, full)
     if robot.table is not None:  # a box whose upper side is so far above the base's origin
@@ -142,25 +143,13 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
     model, geometry = pin.buildReducedModel(full, geometry, locked, rest_full)
     names = tuple(model.names[1:])
     lower, upper = np.array([_narrow_range(name, limits[name], margins) for name in names]).T
-    scale = min(margins.speed_scale, MAX_SPEED_SCALE)
-    velocity = {name: limits[name].velocity for name in names}
-    v_max, a_max, j_max = (
-        scale * np.array([values[name] for name in names]) for values in (velocity, robot.acceleration, robot.jerk)
-    )
+    largest = [(limits[name].velocity, robot.acceleration[name], robot.jerk[name]) for name in names]
+    v_max, a_max, j_max = min(margins.speed_scale, MAX_SPEED_SCALE) * np.array(largest).T
     rest = np.clip([robot.rest.get(name, 0.0) for name in names], lower + REST_MARGIN, upper - REST_MARGIN)
     built = Robot(
         robot, names, full, model, geometry, lower, upper, v_max, a_max, j_max, rest, rest_full, R_BT, (), margins
     )  # fmt: skip
     return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
-
-
-def find_link(model: Any, name: str) -> Any:
-    """The frame of a link."""
-    return model.frames[model.getFrameId(name)]
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict[str, JointLimit]) -> None:
@@ -171,23 +160,21 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
         for key, point in arm._asdict().items():
             if isinstance(point, LinkPoint | HandPoint):
                 robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
-        joint, chain = find_link(full, arm.hand.link).parentJoint, set[str]()
+        joint, chain = full.frames[full.getFrameId(arm.hand.link)].parentJoint, set[str]()
         while joint > 0:
             chain.add(full.names[joint])
             joint = full.parents[joint]
         for name in arm.joints:
             robot.check_name(where, "moving joint", name, limits)
-            copies = [other for other, limit in limits.items() if limit.mimic is not None and limit.mimic[0] == name]
-            mimic, problem = limits[name].mimic, ""
-            if name not in chain:
-                problem = f"does not move the hand's link '{arm.hand.link}'"
-            elif mimic is not None or copies:
-                problem = f"copies '{mimic[0]}'" if mimic is not None else f"is copied by '{copies[0]}'"
-            if problem:
-                raise BadModel(
-                    f"{robot.where}: {where}: '{name}' is no joint of the arm: it {problem}; leave it out, it stays "
-                    "where `rest` has it"
-                )
+            mimic = limits[name].mimic
+            problems = [f"does not move the hand's link '{arm.hand.link}'"] * (name not in chain)
+            problems += [f"copies '{mimic[0]}'"] if mimic is not None else []
+            problems += [
+                f"is copied by '{other}'" for other, limit in limits.items() if (limit.mimic or ("",))[0] == name
+            ]
+            if problems:
+                text = f"'{name}' is no joint of the arm: it {problems[0]}"
+                raise BadModel(f"{robot.where}: {where}: {text}; leave it out, it stays where `rest` has it")
             _check_limits(robot, name, limits[name])
     for name in robot.rest:
         robot.check_name("rest", "moving joint", name, limits)
@@ -197,19 +184,14 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
 
 def _check_limits(robot: RobotMap, name: str, limit: JointLimit) -> None:
     """Raise `BadModel` where the URDF or the map lacks a limit of a joint."""
-    lacking = ""
-    if limit.kind != "continuous" and not limit.lower < limit.upper:
-        lacking = f"position limits ({limit.lower:g} to {limit.upper:g})"
-    elif not 0.0 < limit.velocity < np.inf:
-        lacking = f"velocity limit ({limit.velocity:g})"
+    lacking = ["position limits"] * (limit.kind != "continuous" and not limit.lower < limit.upper)
+    lacking += ["velocity limit"] * (not 0.0 < limit.velocity < np.inf)
     if lacking:
-        raise BadModel(f"{robot.urdf}: joint '{name}' has no {lacking}; write it into the map's [limits]")
+        raise BadModel(f"{robot.urdf}: joint '{name}' has no {lacking[0]}; write it into the map's [limits]")
     for key, values in (("acceleration", robot.acceleration), ("jerk", robot.jerk)):
         if not values.get(name, 0.0) > 0.0:
             state = f"is {values[name]:g}" if name in values else "has none"
-            raise BadModel(
-                f"{robot.where}: limits.{key}: joint '{name}' {state}; no URDF holds it, a number above 0 is needed"
-            )
+            raise BadModel(f"{robot.where}: limits.{key}: joint '{name}' {state}; a number above 0 is needed")
 
 
 def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit]) -> np.ndarray:
@@ -238,7 +220,7 @@ def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
             full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=package_folders(robot.urdf)
         )
     except Exception as error:  # what C++ throws
-        raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {_first_line(error)}") from error
+        raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {reason(error)}") from error
     for link, (xyz, rpy) in robot.collision.items():
         own = [shape for shape in geometry.geometryObjects if shape.name.rpartition("_")[0] == link]
         if len(own) != 1:
@@ -247,7 +229,7 @@ def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
                 "one is needed"
             )
         origin = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
-        own[0].placement = find_link(full, link).placement * origin
+        own[0].placement = full.frames[full.getFrameId(link)].placement * origin
     return geometry
 
 
@@ -260,15 +242,6 @@ def _narrow_range(name: str, limit: JointLimit, margins: LimitMargins) -> tuple[
         text = f"joint '{name}' moves from {limit.lower:g} to {limit.upper:g} only"
         raise WrongOption("limit-margin", f"{margins.limit_margin:g}", text)
     return lower, upper
-
-
-def _find_base(robot: RobotMap, full: Any, rest_full: np.ndarray) -> Any:
-    """Placement of the base in B."""
-    if not robot.base:
-        return pin.SE3.Identity()
-    data = full.createData()
-    pin.framesForwardKinematics(full, data, rest_full)
-    return data.oMf[full.getFrameId(robot.base)]
 
 
 def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
@@ -293,7 +266,7 @@ def _build_rotation(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _add_frame(model: Any, point: LinkPoint | HandPoint, name: str, R: np.ndarray | None = None) -> int:
-    link = find_link(model, point.link)
+    link = model.frames[model.getFrameId(point.link)]
     placement = link.placement * pin.SE3(np.eye(3) if R is None else R, np.array(point.offset))
     return int(model.addFrame(pin.Frame(f"wepose_{name}", link.parentJoint, placement, pin.FrameType.OP_FRAME)))
 

@@ -1,7 +1,7 @@
 """Robot commands while the person moves: causal targets, a limited approach to them, the control step.
 
 Three stages lie between a pose and the robot. A causal low-pass smooths the targets (`_LowPass`). A reference moves
-from the robot's hand to its target no faster than the tracking's quality allows (`HandReference`): it makes the
+from the robot's hand to its target no faster than the tracking's quality allows (`_HandReference`): it makes the
 approach, slows the robot where tracking is poor, and keeps jumps from it. The control step (`QpController`) keeps the
 limits, also while braking. Time is an argument: nothing here reads a clock.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -19,13 +19,13 @@ import pinocchio as pin
 
 from ..body import BodyTable, load_table
 from ..errors import WrongOption
-from .approach import HandReference, compute_norm, start_references
 from .collision import CollisionModel
 from .controller import JointState, QpController
 from .robot import Robot
 from .targets import (
     JUMP_SPEED,
     STD_POOR,
+    WEIGHT_POOR,
     ArmMotion,
     HandTarget,
     check_person_arms,
@@ -47,6 +47,14 @@ WAITING = "waiting for a pose"
 TRUSTED = 0.9  # below it the state is "slow"
 # A hand so far off its target, while it and its joints move slower than that, for so long, is stuck.
 STUCK_M, STUCK_SPEED, STUCK_S = 0.05, 0.05, 1.0  # [m], [m/s and rad/s], [s]
+
+APPROACH_SPEED = 0.25  # [m/s] of a reference that has not reached its target yet
+APPROACH_GROWTH = 0.1  # [m/s²] of that speed, so that it also reaches a target that moves
+FREE_SPEED = 12.0  # [m/s] of a reference at a trusted target: only the robot's limits count
+TURN_RATIO = 2.4  # [rad/m] of the reference's angular speed to its speed
+CLOSING_GAIN = 5.0  # [1/s] at which the reference closes the distance to its target
+REACHED_M, REACHED_RAD = 0.02, 0.1  # distance at which it has reached its target
+SPEED_UP_S, SPEED_DOWN_S = 0.2, 0.1  # [s] time constants of the speed allowed
 
 
 class ArmObservation(NamedTuple):
@@ -99,6 +107,64 @@ def _relax(
     d, decay = away + behind, np.exp(-omega * dt)
     c = rate - input_rate + omega * d
     return (d + c * dt) * decay - behind, input_rate + (rate - input_rate - omega * c * dt) * decay
+
+
+@dataclass
+class _HandReference:
+    """The reference of a live hand: it moves from the robot's hand to its target, and then with it.
+
+    Its acceleration is limited to what the joints can do: a robot that is asked for more shakes, and comes so near to
+    itself that its limits leave no way out.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    max_acceleration: float  # [m/s²]
+    speed: float = APPROACH_SPEED  # [m/s] allowed now
+    reached: bool = False
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    angular_velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def step(self, target: HandTarget, dt: float) -> HandTarget:
+        """Target of the hand in this step, on the way to `target`."""
+        away, turn = target.position - self.position, pin.log3(target.rotation @ self.rotation.T)
+        self.reached = self.reached or (_norm(away) < REACHED_M and _norm(turn) < REACHED_RAD)
+        if self.reached:
+            trust = (target.weight - WEIGHT_POOR) / (1.0 - WEIGHT_POOR)
+            target_speed = APPROACH_SPEED * (FREE_SPEED / APPROACH_SPEED) ** trust
+            up, down = np.exp(dt / SPEED_UP_S), np.exp(-dt / SPEED_DOWN_S)
+            self.speed = float(min(max(target_speed, down * self.speed), up * self.speed))
+        else:
+            self.speed += APPROACH_GROWTH * dt * float(target.weight)
+        speed, limit = self.speed, self.max_acceleration
+        self.velocity = _approach_velocity(self.velocity, target.velocity, away, speed, limit, dt)
+        self.angular_velocity = _approach_velocity(
+            self.angular_velocity, target.angular_velocity, turn, TURN_RATIO * speed, TURN_RATIO * limit, dt
+        )
+        position = self.position + 0.5 * dt * self.velocity
+        rotation = pin.exp3(0.5 * dt * self.angular_velocity) @ self.rotation
+        self.position = self.position + dt * self.velocity
+        self.rotation = pin.exp3(dt * self.angular_velocity) @ self.rotation
+        return HandTarget(position, self.velocity, rotation, self.angular_velocity, target.swivel, target.weight)
+
+
+def _approach_velocity(
+    v: np.ndarray, target: np.ndarray, away: np.ndarray, speed: float, max_acceleration: float, dt: float
+) -> np.ndarray:
+    """Next velocity: the target's, and what closes the distance and stops with half of `max_acceleration`."""
+    far = _norm(away)
+    gain = min(CLOSING_GAIN, np.sqrt(max_acceleration / far)) if far > 0.0 else CLOSING_GAIN
+    return v + _limit_norm(_limit_norm(target + gain * away, speed) - v, max_acceleration * dt)
+
+
+def _norm(v: np.ndarray) -> float:
+    """As `np.linalg.norm` of (3,), in a fifth of the time."""
+    return math.sqrt(v @ v)
+
+
+def _limit_norm(v: np.ndarray, limit: float) -> np.ndarray:
+    size = _norm(v)
+    return v if size <= limit else v * (limit / size)
 
 
 class ArmObserver:
@@ -234,7 +300,7 @@ class CommandStream:
         self._low_passes: list[_LowPass] = []
         self._trust, self._stuck_s = np.ones(len(robot.arms)), np.zeros(len(robot.arms))
         self.stuck: dict[str, float] = {}
-        self._references: list[HandReference] | None = None
+        self._references: list[_HandReference] | None = None
         self._approach_reason = self._stop_reason = self._end_reason = ""
 
     @property
@@ -258,7 +324,7 @@ class CommandStream:
                 low_pass.push(observation.motion, dt, self._omega)
             return True
         if continues:
-            self._restart_approach("the pose jumped")
+            self._references, self._approach_reason = None, "the pose jumped"
         self._low_passes = [_LowPass(observation.motion) for observation in observed]
         return True
 
@@ -283,16 +349,18 @@ class CommandStream:
         """Continue after a stop as soon as a pose comes, by an approach; approach anew where the robot follows."""
         if self._stop_reason:
             self._stop_reason, self._observed = "", []
-        self._restart_approach("reset")
-
-    def _restart_approach(self, reason: str) -> None:
-        self._references, self._approach_reason = None, reason
+        self._references, self._approach_reason = None, "reset"
 
     def _follow(self, now: float) -> Command:
         """A step towards the newest pose."""
         dt = self.dt
         if self._references is None:
-            self._references = start_references(self._controller, self.state.position)
+            self._controller.update_kinematics(self.state.position)
+            poses = (self._controller.get_arm_pose(i) for i in range(len(self.robot.arms)))
+            limits = (arm.reach * float(np.median(self.robot.a_max[arm.joints])) for arm in self.robot.arms)
+            self._references = [
+                _HandReference(pose.hand, pose.rotation, limit) for pose, limit in zip(poses, limits, strict=True)
+            ]
         for i, observation in enumerate(self._observed):
             std = STD_POOR if observation.lost else 0.0 if math.isnan(observation.std) else observation.std
             trust = float(compute_weight(std))
@@ -308,7 +376,7 @@ class CommandStream:
         for i, target in enumerate(targets):
             pose = self._controller.get_arm_pose(i)
             turn = pin.log3(target.rotation @ pose.rotation.T)
-            error[i] = compute_norm(pose.hand - target.position), compute_norm(turn)
+            error[i] = _norm(pose.hand - target.position), _norm(turn)
         if not all(reference.reached for reference in self._references):
             why = "" if self._approach_reason in ("", WAITING) else f": {self._approach_reason}"
             return self._command("approach", f"on the way to the person's hands{why}", error)
@@ -322,7 +390,7 @@ class CommandStream:
         """Say which hands have been off targets that do not move, though the robot has had the time to reach them."""
         reasons = []
         for i, (arm, target, off) in enumerate(zip(self.robot.arms, targets, error.tolist(), strict=True)):
-            speed = max(compute_norm(target.velocity), float(np.abs(self.state.velocity[arm.joints]).max()))
+            speed = max(_norm(target.velocity), float(np.abs(self.state.velocity[arm.joints]).max()))
             self._stuck_s[i] = self._stuck_s[i] + self.dt if off > STUCK_M and speed < STUCK_SPEED else 0.0
             if self._stuck_s[i] > STUCK_S:
                 self.stuck[arm.side] = max(off, self.stuck.get(arm.side, 0.0))
@@ -345,7 +413,7 @@ class CommandStream:
 
     def _brake_to_rest(self, reason: str, final: bool = False) -> Command:
         """A step to rest, within the limits."""
-        self._restart_approach(reason)
+        self._references, self._approach_reason = None, reason
         self.state = self._controller.brake(self.state)
         error = np.full((len(self.robot.arms), 2), np.nan)
         return self._command("stopped" if final and self.state.is_static else "hold", reason, error)
@@ -359,8 +427,8 @@ class CommandStream:
 def _jumps(before: list[ArmObservation], now: list[ArmObservation], dt: float) -> bool:
     """Whether a hand moved or rotated faster than any can."""
     return any(
-        compute_norm(b.motion.offset - a.motion.offset) > JUMP_SPEED * b.scale * dt
-        or compute_norm(pin.log3(b.motion.rotation @ a.motion.rotation.T)) > JUMP_RATE * dt
+        _norm(b.motion.offset - a.motion.offset) > JUMP_SPEED * b.scale * dt
+        or _norm(pin.log3(b.motion.rotation @ a.motion.rotation.T)) > JUMP_RATE * dt
         for a, b in zip(before, now, strict=True)
     )
 

@@ -162,24 +162,21 @@ def check_person_arms(
     table : of the person's body; None: the upper body
     """
     table, missing = table or load_table(), {}
-    sides = {arm.side for arm in robot.arms} | {table.side(tip) for tip in table.drawn_limbs}
-    for side in sides.intersection(robot.map.arms):
+    for side in (arm.side for arm in robot.arms):
         limb = find_person_arm(table, side)
         needed = (str(limb.base), *limb.segments[:-1])
         missing[side] = [name for name in needed if name not in segments]
         missing[side] += [name for name in limb.points if points is not None and name not in points]
-    lacking = [arm.side for arm in robot.arms if missing[arm.side]]
-    if not lacking:
-        return
     text = "; ".join(
-        f"{robot.map.name}'s {side} arm follows {', '.join(missing[side])}, which the sensors do not measure"
-        for side in lacking
+        f"{robot.map.name}'s {side} arm follows {', '.join(names)}, which the sensors do not measure"
+        for side, names in missing.items()
+        if names
     )
-    usable = next((side for side in missing if not missing[side]), None)
-    if usable is not None:
-        raise BadData(f"{text}; choose arm {usable}")
-    names = [table.shared_name(name).replace("_", " ") for name in needed]
-    raise BadData(f"{text}; an arm needs sensors on {', '.join(names[:-1])} and {names[-1]}")
+    if text:
+        usable = [f"choose arm {side}" for side, names in missing.items() if not names]
+        parts = [table.shared_name(name).replace("_", " ") for name in needed]
+        needs = f"an arm needs sensors on {', '.join(parts[:-1])} and {parts[-1]}"
+        raise BadData(f"{text}; {[*usable, needs][0]}")
 
 
 def compute_arm_targets(
@@ -227,11 +224,11 @@ def compute_arm_targets(
         for values in motion:
             known &= np.isfinite(values.reshape(len(time), -1)).all(axis=1)
         for segment in (str(limb.base), *limb.segments):
-            if segment in pose.gap:
-                known &= ~np.asarray(pose.gap[segment], dtype=bool)
+            known &= ~np.asarray(pose.gap.get(segment, False), dtype=bool)
         if known.sum() < 2:
-            text = "its orientations are missing, or lost"
-            raise BadData(f"the {arm.side} arm is not known anywhere in the pose: {text}")
+            raise BadData(
+                f"the {arm.side} arm is not known anywhere in the pose: its orientations are missing, or lost"
+            )
         cov = pose.point_cov.get(limb.tip)
         std = np.zeros(len(time)) if cov is None else np.nan_to_num(compute_axis_std(cov), nan=STD_POOR)
         std = np.where(known, std, STD_POOR)

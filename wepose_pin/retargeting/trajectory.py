@@ -7,8 +7,9 @@ motion within the true limits, with the joint path of the first run as posture r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -22,11 +23,11 @@ from ..body import BodyTable
 from ..body.kinematics import Pose, find_samples
 from ..body.urdf import read_urdf, resolve_meshes
 from ..errors import BadOption, WrongOption
-from ..recording import Intervals, select_interval
+from ..recording import select_interval
 from ..tracking import TrackResult
 from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel
-from .controller import ControllerParams, JointState, PostureReference, QpController, StepReport
+from .controller import ControllerParams, JointState, QpController, StepReport
 from .limits import MAX_STOP_S
 from .maps import find_map, list_sides
 from .placement import place_root
@@ -60,7 +61,6 @@ class LimitingJoint(NamedTuple):
 
     joint: str
     time: float  # [s] of the recording
-    factor: float  # of what it needs there to its limit
     quantity: str  # of `QUANTITIES`
 
 
@@ -103,12 +103,6 @@ class Trajectory:
     def hand(self) -> dict[str, np.ndarray]:
         """Side → position (n, 3) [m] of the hand in B."""
         return {arm.side: self.run.hand[i] for i, arm in enumerate(self.robot.arms)}
-
-    @property
-    def contact_times(self) -> list[float]:
-        """[s] of the recording at which the robot braked, since no step kept all limits and left it a way to stop."""
-        stopping = self.run.report.stopping
-        return np.round(self.recorded_time[stopping & ~np.roll(stopping, 1)], 2).tolist()
 
     def joint_motion(self) -> JointMotion:
         """Return the motion as `export` takes it, the robot standing on the floor."""
@@ -211,8 +205,7 @@ def retarget(
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
     arm_targets = compute_arm_targets(pose, robot, table=table or body_table, scale=scale, smoothing_hz=smoothing_hz)
-    report = progress or (lambda _text, _fraction: None)
-    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, report)
+    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, progress or (lambda _text, _fraction: None))
 
 
 def _select_pose(
@@ -222,12 +215,10 @@ def _select_pose(
     if isinstance(pose, str | Path):
         from ..writers import read_result
 
-        selected_pose, body, _ = read_result(Path(pose), interval, phase)
-        return selected_pose, body.table
-    phases: Mapping[str, Intervals] = {}
-    table = None
-    if isinstance(pose, TrackResult):
-        phases, table, pose = pose.phases, pose.model.table, pose.pose
+        cut, body, _ = read_result(Path(pose), interval, phase)
+        return cut, body.table
+    phases, table = (pose.phases, pose.model.table) if isinstance(pose, TrackResult) else ({}, None)
+    pose = pose.pose if isinstance(pose, TrackResult) else pose
     selected = select_interval(pose.time, phases, interval, phase)
     return pose if selected is None else pose.cut(find_samples(pose.time, selected)), table
 
@@ -246,7 +237,7 @@ def _compute_trajectory(
     motion = arm_targets.resample(arm_targets.time[0] + clock, clock)
     wide = QpController(robot, collision, step, params, WIDE_LIMIT_FACTOR, guarded=False)
     motion, approach_samples = _prepend_approach(wide, motion)
-    run = _run_controller(wide, motion.hands, None, None, lambda fraction: progress(STAGES[0], fraction))
+    run = _run_controller(wide, motion.hands, None, None, partial(progress, STAGES[0]))
     path = gaussian_filter1d(run.joint_position, PATH_SMOOTHING_S / step, axis=0, mode="nearest")
     slowdown, limiting = _compute_slowdown(path, robot, step, motion, approach_samples)
     # The motion's own time, its samples on the robot's time, and the moments of the motion at the robot's times.
@@ -259,13 +250,8 @@ def _compute_trajectory(
     posture = CubicSpline(clock, path)(moments)
     posture_weight = TRACKING_POSTURE_FACTOR * params.posture
     tracking_params = replace(params, posture=posture_weight, posture_gain=TRACKING_POSTURE_GAIN)
-    run = _run_controller(
-        QpController(robot, collision, dt, tracking_params),
-        targets.hands,
-        posture,
-        int((sample_time[-1] + SETTLE_S) / dt),
-        lambda fraction: progress(STAGES[1], fraction),
-    )
+    tracking, settle = QpController(robot, collision, dt, tracking_params), int((sample_time[-1] + SETTLE_S) / dt)
+    run = _run_controller(tracking, targets.hands, posture, settle, partial(progress, STAGES[1]))
     n = len(run.joint_position)
     return Trajectory(
         robot=robot,
@@ -308,7 +294,7 @@ def _run_controller(
     latest, brakes = n - round(MAX_STOP_S / dt), False
     for k in range(n):
         if posture is not None and rate is not None:
-            controller.posture_reference = PostureReference(posture[k], rate[min(k + 1, n - 1)])
+            controller.posture_reference = posture[k], rate[min(k + 1, n - 1)]
         brakes |= settle is not None and k >= settle and (k >= latest or np.abs(state.velocity).max() < SETTLED)
         ends = brakes and state.is_static
         states.append(state)
@@ -339,11 +325,9 @@ def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[Arm
     ends = []
     for i, path in enumerate(motion.hands):
         pose = controller.get_arm_pose(i)
-        ends.append((pose, Rotation.from_matrix(np.stack([pose.rotation, path.rotation[0]]))))
-        distance, angle = (
-            np.linalg.norm(path.position[0] - pose.hand),
-            (ends[i][1][0].inv() * ends[i][1][1]).magnitude(),
-        )
+        first, last = rotations = Rotation.from_matrix(np.stack([pose.rotation, path.rotation[0]]))
+        ends.append((pose, rotations))
+        distance, angle = np.linalg.norm(path.position[0] - pose.hand), (first.inv() * last).magnitude()
         needed = distance / APPROACH_SPEED, angle / APPROACH_ANGULAR_SPEED
         longest = max(longest, QUINTIC_PEAK_SPEED * float(max(needed)))
     steps = round(longest / dt)
@@ -381,8 +365,7 @@ def _compute_slowdown(
     k = approach_samples + int(np.argmax(longest[approach_samples:]))
     if longest[k] > 1.0:
         quantity, j = np.unravel_index(int(np.argmax(needed[:, k])), needed[:, k].shape)
-        ratio = (np.abs(v[k]) / robot.v_max, np.abs(a[k]) / robot.a_max, np.abs(jerk[k]) / robot.j_max)[quantity][j]
-        limiting = LimitingJoint(robot.names[j], float(motion.time[k]), float(ratio), QUANTITIES[quantity])
+        limiting = LimitingJoint(robot.names[j], float(motion.time[k]), QUANTITIES[quantity])
     slowdown = np.minimum(np.maximum(np.maximum(longest, 1.0), motion.slowdown), MAX_SLOWDOWN)
     width = max(1, round(SLOWDOWN_SPREAD_S / dt))
     wide = maximum_filter1d(slowdown, 2 * width + 1, mode="nearest")
