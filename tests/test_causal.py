@@ -133,23 +133,6 @@ def test_resets_at_once_and_before_the_first_pose(recording: Recording) -> None:
         assert all(np.array_equal(stepped[i], pose.quat_WL[name][k - begin]) for i, name in enumerate(tracker.names))
 
 
-def test_a_gap_in_the_start_pose_is_bridged_by_what_is_left_of_it(recording: Recording) -> None:
-    """Neither by what the file has there, nor by what came after."""
-    begin = recording.span(recording.phases["start"][0]).stop
-    gap = np.zeros(len(recording), dtype=bool)
-    gap[begin - 100 : begin + 100] = True
-    torso = recording.sensors["torso"]
-    poses = []
-    for value in (0.0, 0.3):
-        gyro_S = np.where(gap[:, None], value, torso.gyro_S)
-        sensors = {**recording.sensors, "torso": replace(torso, gyro_S=gyro_S, gap=gap)}
-        poses.append(track(replace(recording, sensors=sensors), causal=True))
-    assert np.array_equal(poses[0].quat_WL["torso"], poses[1].quat_WL["torso"])
-    silent = replace(torso, gap=np.arange(len(recording)) < begin + 10)
-    with pytest.raises(BadPhase, match=r"sensors\.torso sent nothing in it"):
-        track(replace(recording, sensors={**recording.sensors, "torso": silent}), causal=True)
-
-
 def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
     recording = replace(recording, resets=(1500, 2900))
     named, unnamed = recording, replace(recording, phases={})

@@ -48,17 +48,9 @@ def deviations(calibration: Calibration, moved: Moved) -> np.ndarray:
     return np.array([(subject.lengths[name] - true) / subject.std(name) for name, true in moved.lengths.items()])
 
 
-def describe(what: str, calibration: Calibration, moved: Moved) -> None:
-    for name, true in moved.lengths.items():
-        value, std = calibration.subject.lengths[name], calibration.subject.std(name)
-        print(f"{what:24} {name:10} {1e3 * value:7.1f} ± {1e3 * std:4.1f} mm, true {1e3 * true:.1f}")
-
-
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> None:
-    moved = move_arm(arm, seed)
+def test_lengths_are_found_within_their_deviation(arm: BodyModel) -> None:
+    moved = move_arm(arm, 0)
     calibration = calibrate_arm(arm, moved)
-    describe(f"one point, seed {seed}", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
     assert calibration.rms_gap < 0.2 * calibration.prior_rms_gap
     for name in TRUE:  # a tenth before the motion
@@ -67,15 +59,10 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
     assert "shoulder_link" not in [check.diagnostic.place for check in assess(calibration).checks]
 
 
-def calibrate_four_bar(body: BodyModel, seed: int) -> tuple[Calibration, Moved]:
-    moved = move_four_bar(body, seed)
-    return calibrate_arm(body, moved, on_point(at=moved.tip[0])), moved
-
-
 def test_a_loop_closed_with_the_world(four_bar: BodyModel) -> None:
     """A four-bar linkage: both its ends are at known places of the ground, so all three lengths are shown."""
-    calibration, moved = calibrate_four_bar(four_bar, 0)
-    describe("four-bar linkage", calibration, moved)
+    moved = move_four_bar(four_bar, 0)
+    calibration = calibrate_arm(four_bar, moved, on_point(at=moved.tip[0]))
     assert np.abs(deviations(calibration, moved)).max() < 3.0
     for name in LENGTHS:  # a tenth before the motion
         assert calibration.subject.std(name) < 0.04 * moved.lengths[name]
@@ -91,7 +78,6 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
     pl.DataFrame(columns).write_parquet(tmp_path / "optical.parquet")
     moved = replace(moved, recording=replace(moved.recording, truth=tmp_path / "optical.parquet"))
     calibration = calibrate_arm(arm, moved, Closure("tip", "recorded", ("tip",), slip=0.001))
-    describe("recorded tip", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
     seen = np.interp(calibration.time, time, (~lost).astype(float))
     assert seen.min() == 1.0
@@ -167,16 +153,3 @@ def test_a_chain_by_option_has_its_report_and_its_live_recording(
     run(*replay, "--model", model, "--subject", cal, "--accept-failed")
     run("track", log, "-o", tmp_path / "result", "--no-report", "--no-view")
     assert (tmp_path / "result" / "joints.parquet").exists()
-
-
-@pytest.mark.monte_carlo
-def test_stated_deviations_are_right_over_seeds(arm: BodyModel, four_bar: BodyModel) -> None:
-    z: dict[str, list[np.ndarray]] = {"arm": [], "four-bar": []}
-    for seed in range(10, 20):
-        moved = move_arm(arm, seed)
-        z["arm"].append(deviations(calibrate_arm(arm, moved), moved))
-        z["four-bar"].append(deviations(*calibrate_four_bar(four_bar, seed)))
-    for name, each in z.items():
-        rms = np.sqrt(np.mean(np.square(each)))
-        print(f"{name}: rms of z over {len(each)} seeds: {rms:.2f}")
-        assert 0.4 < rms < 1.6, name

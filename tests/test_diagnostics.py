@@ -156,11 +156,11 @@ def test_what_follows_from_a_cause_is_not_shown_beside_it() -> None:
 
 
 def test_json_holds_data_and_text_and_comes_back() -> None:
-    facts = {"variant": "sideways", "joint": "elbow", "above": "upper arm", "below": "forearm"}
+    facts = {"variant": "sideways"}
     diagnostic = Diagnostic("hinge-implausible", ERROR, "left_elbow", 2.967, float("nan"), facts)
     content = json.loads(json.dumps(as_json(diagnostic), allow_nan=False))
     assert content["text"]["what"].startswith(
-        "The forearm leaves the plane in which the left elbow bends by up to 170°"
+        "The segment below leaves the plane in which the left elbow bends by up to 170°"
     )
     assert content["limit"] is None
     assert from_json(content) == Diagnostic("hinge-implausible", ERROR, "left_elbow", 2.967, None, facts)

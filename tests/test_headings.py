@@ -11,8 +11,6 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
-import wepose_pin as wp
-from wepose_pin.body import load_model
 from wepose_pin.body.covariance import compute_axis_std, compute_point_covariances
 from wepose_pin.body.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.errors import BadSubject
@@ -21,8 +19,6 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import Tracker, TrackResult, summarize, track
-from wepose_pin.tracking.heading_filter import LEARNED_VARIANCE_RATIO, HeadingFilter, estimate_headings
-from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
 from wepose_pin.tracking.measures import measure_hinge
 
 # The simulated person's shoulders stay in place, against the law of the table.
@@ -173,70 +169,6 @@ def test_the_drift_that_all_sensors_may_share_is_in_the_torsos_heading(causal: b
     assert drift[True] > 4.0
     # Five sensors share what they know of the drift that is common to them.
     assert 0.3 * drift[True] < drift[False] < 1.2 * drift[True]
-
-
-KNOT_S, START_STD, BIAS_STD = 2.0, np.deg2rad(1.0), np.deg2rad(0.5)
-KNOWN_STD = 0.02 * BIAS_STD
-
-
-def make_filter() -> HeadingFilter:
-    """Of a segment whose heading nothing observes but its orientation filter."""
-    problem = HeadingProblem(
-        ("torso",), load_model(), wp.population_subject(), (), (), np.zeros((0, 3)), {}, PERSON_NOISE, 8.0, 1, 16,
-        np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros(1, dtype=bool), np.zeros(1), np.full(1, BIAS_STD),
-        np.full(1, START_STD**2), np.full(1, np.deg2rad(6.0) ** 2), 0.0,
-    )  # fmt: skip
-    return HeadingFilter(problem, say((0.0, 0.0, BIAS_STD**2)))
-
-
-def say(about_vertical: tuple[float, ...]) -> FilterHeadings:
-    """What a filter says: correction of the heading and of the rate, variance of the rate."""
-    return FilterHeadings(np.zeros(1), *np.array(about_vertical)[:, None])
-
-
-def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...]) -> np.ndarray:
-    """Step through knots at whose ends the filter says the same; return the heading's standard deviations [rad]."""
-    nothing = np.zeros((0, 1, 4)), np.zeros((0, 1, 3, 8))
-    variance = []
-    for _ in range(knots):
-        list(state.step(Knot(*nothing, say(about_vertical), np.zeros(1, dtype=bool), {})))
-        variance.append(estimate_headings(state.problem, state.x, state.P, 0.0).segment_covariance[0, 0])
-    return np.sqrt(variance)
-
-
-def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_its_bias() -> None:
-    """Nothing is observed: the mount cancels, the rate adds up, and less is left once the filter knows its bias."""
-    state = make_filter()
-    np.testing.assert_allclose(
-        np.diag(estimate_headings(state.problem, state.x, state.P, 0.0).segment_covariance), START_STD**2
-    )
-    growing = go_on(state, 10, (0.0, 0.0, BIAS_STD**2))
-    assert growing[-1] == pytest.approx(np.hypot(START_STD, 20.0 * np.hypot(BIAS_STD, PERSON_NOISE.rate_std)), rel=0.05)
-    standing = go_on(state, 20, (0.0, 0.0, KNOWN_STD**2))
-    assert standing[-1] - standing[-6] < 1.1 * 10.0 * np.sqrt(LEARNED_VARIANCE_RATIO) * PERSON_NOISE.rate_std
-
-
-def test_a_bias_that_a_filter_has_found_corrects_the_heading_as_far_as_nothing_else_has_observed_it() -> None:
-    """After 20 s a filter turns its heading by −t Δb and its bias by Δb."""
-    bias, seconds = np.deg2rad(0.6), 20.0
-    for observed, remaining in ((False, 0.0), (True, 1.0)):
-        state = make_filter()
-        go_on(state, round(seconds / KNOT_S), (0.0, 0.0, BIAS_STD**2))
-        if observed:
-            state.P *= 1e-4
-        go_on(state, 1, (-seconds * bias, bias, KNOWN_STD**2))
-        np.testing.assert_allclose(state.x[:2], remaining * bias * np.array([seconds, 1.0]), atol=0.1 * bias * seconds)
-        assert abs(state.x[1] - remaining * bias) < 0.1 * bias
-
-
-def test_a_rate_is_unknown_again_once_an_axis_of_unknown_bias_is_vertical() -> None:
-    state = make_filter()
-    go_on(state, 2, (0.0, 0.0, KNOWN_STD**2))
-    before = state.P[1, 1]
-    go_on(state, 1, (0.0, 0.0, KNOWN_STD**2))
-    assert state.P[1, 1] < 1.1 * before
-    go_on(state, 1, (0.0, 0.0, BIAS_STD**2))
-    assert state.P[1, 1] > 0.9 * BIAS_STD**2
 
 
 def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simulation, Subject]) -> None:

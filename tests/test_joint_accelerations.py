@@ -89,8 +89,8 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
     zeros = np.zeros(2)
     filters = FilterHeadings(*np.zeros((4, 2)))
     problem = HeadingProblem(
-        names, load_model(), population_subject(), (pair,), (), np.zeros((0, 3)), {}, PERSON_NOISE, rate_hz, 1, samples,
-        np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.zeros(2, dtype=bool), zeros, np.full(2, 1e-4),
+        names, load_model(), population_subject(), (pair,), (), np.zeros((0, 3)), None, PERSON_NOISE, rate_hz, 1,
+        samples, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.zeros(2, dtype=bool), zeros, np.full(2, 1e-4),
         np.deg2rad([0.1, 20.0]) ** 2, zeros, 0.0,
     )  # fmt: skip
     z = []
@@ -104,7 +104,7 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
             rows = slice(begin, begin + samples)
             sides = accelerations.push(R_WS[rows], accel_S[rows])[::5]
             quats = np.tile([0.0, 0.0, 0.0, 1.0], (1, 2, 1))
-            list(state.step(Knot(quats, sides, filters, np.zeros(2, dtype=bool), {})))
+            list(state.step(Knot(quats, sides, filters, np.zeros(2, dtype=bool), np.zeros(len(quats), dtype=bool))))
         z.append((off - state.x[1] + state.x[0]) / np.sqrt(state.P[1, 1] + state.P[0, 0] - 2.0 * state.P[0, 1]))
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 

@@ -14,14 +14,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, quality
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import ERROR, from_json, render
 from wepose_pin.errors import BadSubject
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
-    IDEAL_PRESET,
     MILD_PRESET,
     Imperfections,
     Person,
@@ -170,6 +169,7 @@ def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: P
     assert quality.quality == wanted
     assert set(first) <= set(reasons)
     assert bool(reasons) == (wanted != "pass")
+    assert "headings-ambiguous" not in {each.code for each in quality.diagnostics}
     assert len(set(reasons)) == len(reasons)  # each once
     if wanted == "fail":  # of another arrangement of sensors, and beside what was too short, nothing else is said
         assert reasons[0] == first[0]
@@ -204,24 +204,25 @@ def test_a_failed_calibration_says_so_and_is_not_tracked(
 
 
 @pytest.mark.parametrize(
-    ("share", "wanted", "causes"),
+    ("share", "wanted", "cause"),
     [
-        ({"all": 0.05}, "poor", {"sideways", "elevation", "bend"}),
+        ({"all": 0.0}, "fail", "soft-tissue"),
+        ({"all": 0.05}, "poor", "limbs"),
         pytest.param(
             {"roll": 0.02, "pitch": 0.02, "yaw": 0.02},
             "fail",
-            {"lean", "twist"},
+            "spine",
             marks=pytest.mark.slow,
         ),
     ],
 )
-def test_too_little_motion_is_named(share: dict[str, float], wanted: str, causes: set[str], person: Person) -> None:
+def test_too_little_motion_is_named(share: dict[str, float], wanted: str, cause: str, person: Person) -> None:
     calibration = solved(moved_otherwise(person, share).recording(), person)
     quality = assess(calibration)
     print(codes(quality))
     assert quality.quality == wanted
-    variants = [str(each.facts.get("variant", "")) for each in quality.reasons if each.code == "motion-too-small"]
-    assert causes & set(" ".join(variants).split())
+    variants = {each.facts.get("variant", "") for each in quality.reasons if each.code == "motion-too-small"}
+    assert cause in variants
 
 
 @pytest.mark.slow
@@ -295,43 +296,6 @@ def test_exit_code_and_file_carry_the_quality(
         assert content["lengths"]["left_upper_arm"]["std"] > 0.0
         assert {"wepose-pin", "casadi"} <= content["versions"].keys()
     assert QUALITIES == ("pass", "poor", "fail")
-
-
-def test_the_page_has_the_limits_of_the_code() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "calibrate.md").read_text(encoding="utf-8")
-    deg = (np.degrees(1.0), "°")
-    rows: list[list[tuple[quality.QualityLimits, float, str]]] = [
-        [(quality.LENGTH, 1e3, " mm")],
-        [(limits, *deg) for limits in (quality.ARM_HEADING, quality.TORSO_HEADING, quality.OTHER_HEADING)],
-        [(quality.SCALE, 1e2, " %")],
-        [(quality.GAP, 1e3, " mm"), (quality.OPEN_SHARE, 1e2, " %")],
-        [(quality.SAMPLES, 1.0, "")],
-        [(quality.TILT, *deg), (quality.UNUSUAL, 1.0, " std")],
-        [(quality.MEASURED, 1.0, " std")],
-    ]
-    for row in rows:
-        cells = ("; ".join(f"{factor * limits[k]:.3g}{unit}" for limits, factor, unit in row) for k in range(2))
-        assert f"| {' | '.join(cells)} |" in page
-    assert f"above {quality.ENOUGH_SAMPLES:g}" in page
-    assert f"below {1e3 * quality.GAP.passes:g} mm" in page
-
-
-def test_a_clasp_without_motion_is_said_and_no_exchange_of_sensors() -> None:
-    class Still(motions.Motion):
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, **options)
-            self.wander = {name: lambda t: 0.0 * t for name in self.wander}
-
-    person = simulate_person(2)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(TASKS, "clasp", Still)
-        still = simulate(
-            person.lengths, seed=2, imperfections=replace(IDEAL_PRESET, mount="any"), circles=0, clasp_s=20.0
-        )
-    measured = {"shoulder_width": person.measured["shoulder_width"]}
-    quality = calibrate(still.recording(), measured=measured, prior=person.prior).quality
-    assert quality.quality == "fail"
-    assert [reason.code for reason in quality.reasons] == ["motion-too-small"]
 
 
 def test_a_measured_length_that_is_right_to_a_centimetre_is_not_contradicted() -> None:

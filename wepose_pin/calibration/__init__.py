@@ -4,9 +4,9 @@
 `conditions` what follows for a body, `problem` collects inputs and samples. `equations` has the unknowns and residuals
 in CasADi, `priors` what is known before, `least_squares` the problem and its solution by `nlpsol`. `initial_headings`
 searches headings without an initial guess, and `couplings` has what accelerations observe of them. `samples` finds the
-samples connected with the start pose, `weights` weighs them, `ambiguity` compares other minima. `solution` makes of it
-a `result`. `alternatives` tries other labels, and leaves out mounts and poses. `anatomy` and `quality` assess the
-result. `paper` is the published calibration of the lengths alone. `fusion` adds an earlier calibration of the person.
+samples connected with the start pose, `weights` weighs them. `solution` compares other minima and makes a `result`.
+`alternatives` tries other labels, and leaves out mounts. `quality` assesses the result. `paper` is the published
+calibration of the lengths alone.
 """
 
 from .paper import Formulation

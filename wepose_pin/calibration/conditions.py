@@ -10,11 +10,11 @@ import numpy as np
 from ..body import BodyModel
 from ..body.lengths import UNIVERSE
 from ..body.start_pose import StartPose
-from ..body.table_file import check_segments
-from ..errors import BadOption, BadSession
+from ..errors import BadSession
 from ..observations.directions import Level, Pointing
 from ..observations.paths import ZERO_LENGTH, PointPath, SegmentVector, find_path
-from .protocols import Axis, Closure, Direction, Protocol
+from ..recording import Recording
+from .protocols import Closure, Direction, FreeMotion, Protocol
 
 
 @dataclass(frozen=True)
@@ -36,61 +36,44 @@ class Loop:
         return tuple(part for path in self.paths for part in path.vectors)
 
 
-@dataclass(frozen=True)
-class Moving:
-    """Limbs with sensors on these segments move freely: only hinges hold."""
-
-    segments: tuple[str, ...]
-
-
-Constraint = Loop | Pointing | Level | Moving
+Constraint = Loop | Pointing | Level | FreeMotion  # while limbs move freely only hinges hold
 
 
 def resolve_conditions(
-    protocol: Protocol, model: BodyModel, start: StartPose, sensors: Collection[str]
+    protocol: Protocol, model: BodyModel, start: StartPose, recording: Recording
 ) -> tuple[Constraint, ...]:
-    """The protocol's conditions on this body with these sensors.
+    """The protocol's conditions on this body with the recording's sensors.
 
     Raises
     ------
-    BadOption
-        A point or segment that the body does not have.
     BadSession
         A closure between points that no sensor determines, or a pose of a segment without a sensor.
     """
-    table, constraints = model.table, list[Constraint]()
-    where = f"protocol '{protocol.name}': "
+    table, sensors, constraints = model.table, recording.sensors, list[Constraint]()
+    where = f"{recording.where()}: protocol '{protocol.name}': "
     for condition in protocol.conditions:
-        if isinstance(condition, Direction | Axis):
-            posed = (condition.segment, table.reference) if isinstance(condition, Direction) else (condition.segment,)
-            check_segments(table, posed, where, BadOption)
-            for segment in posed:
-                if segment not in sensors:
-                    raise BadSession(
-                        f"{where}no sensor on {segment}, which a pose or an axis is about; add it, or leave out that "
-                        f"condition"
-                    )
         if isinstance(condition, Closure):
-            paths = tuple(find_path(model, start, sensors, points) for points in condition.ways)
+            paths = tuple(find_path(model, start, sensors, points, where) for points in condition.ways)
             between = {part.segment for path in paths for part in path.vectors} - {UNIVERSE}
             if len(between) < (2 if condition.kind == "coincide" else 1):
+                moves = f"only the sensor on {', '.join(between)} moves" if between else "no sensor moves"
                 points = " and ".join(condition.points)
-                moves = f"{points} both move with the sensor on {', '.join(between)}"
-                raise BadSession(
-                    f"{where}{moves if between else f'no sensor moves {points}'}; points that move against each other "
-                    f"are needed"
-                )
+                raise BadSession(f"{where}{moves} {points}; points that move against each other are needed")
             unknown = sum(isinstance(other, Loop) and other.kind == condition.kind for other in constraints)
             constraints.append(Loop(condition, paths, unknown))
-        elif isinstance(condition, Direction):
-            along = start.turn(condition.segment, table.segments[condition.segment].along)
-            direction = start.turn(table.reference, condition.direction)
-            constraints.append(Pointing(condition.segment, table.reference, along, direction, condition.std))
-        elif isinstance(condition, Axis):
-            axis = start.turn(condition.segment, (0.0, 1.0, 0.0))
-            constraints.append(Level(condition.segment, axis, condition.std))
+        elif isinstance(condition, FreeMotion):
+            constraints.append(condition)
         else:
-            constraints.append(Moving(tuple(segment for segment in table.segments if segment in sensors)))
+            segment = condition.segment
+            for each in (segment, table.reference) if isinstance(condition, Direction) else (segment,):
+                if each not in sensors:
+                    raise BadSession(f"{where}no sensor on {each}, which a pose or an axis is about")
+            if isinstance(condition, Direction):
+                along = start.turn(segment, table.segments[segment].along)
+                direction = start.turn(table.reference, condition.direction)
+                constraints.append(Pointing(segment, table.reference, along, direction, condition.std))
+            else:
+                constraints.append(Level(segment, start.turn(segment, (0.0, 1.0, 0.0)), condition.std))
     return tuple(constraints)
 
 

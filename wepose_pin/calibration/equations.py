@@ -42,7 +42,8 @@ from ..observations.directions import Level, Pointing
 from ..observations.hinges import HingePlane
 from ..observations.paths import BodySymbols, GirdleTerm, express_covariance, express_path
 from ..observations.symbols import about_z, product, rotate_back, small_rotation
-from .conditions import Constraint, Loop, Moving
+from .conditions import Constraint, Loop
+from .protocols import FreeMotion
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
 GAP_ROWS = 3  # residuals of a sample's condition
@@ -150,7 +151,7 @@ def sample_functions(layout: Layout, condition: Constraint) -> tuple[ca.Function
         r = condition.residual(quat_WL)
     elif isinstance(condition, Level):
         r[0] = condition.residual(quat_WL, _start_rotation(layout, x, condition.segment))
-    if isinstance(condition, Loop | Moving):
+    if isinstance(condition, Loop | FreeMotion):
         for i, hinge in enumerate(layout.hinges):
             error = x[layout.hinge[i]]
             hinges[i] = hinge.deviation(quat_WL[hinge.on], quat_WL[hinge.moves], error) / HINGE_STD

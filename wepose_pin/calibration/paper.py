@@ -20,10 +20,9 @@ not estimated: mounts, headings and their drift, soft tissue. `full` estimates t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import block_diag, null_space
@@ -33,7 +32,7 @@ from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
 from .conditions import Loop, group_lengths
-from .least_squares import MIN_LENGTH, Observations
+from .least_squares import MIN_LENGTH
 from .problem import CalibrationProblem
 from .protocols import Closure
 from .result import Calibration, MeasuredLength
@@ -43,8 +42,77 @@ Formulation = Literal["full", "paper"]
 LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of the change with the largest effect
 
 
+def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
+    """The calibration with the lengths as the only unknowns.
+
+    Raises
+    ------
+    BadOption
+        Another start pose, other conditions, or a scale that was not measured.
+    BadSession
+        A mount that is not known, or that gravity contradicts.
+    NoSolution
+        The gap does not determine the lengths.
+    """
+    _check_problem(problem)
+    recording, filtered, prior = problem.recording, problem.filtered, problem.prior
+    mounts, headings, mount_diagnostics = align_sensors(recording, prior, filtered.R_VS_start, filtered.start)
+    observations, samples = problem.observe()
+    quat_WL = {
+        name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
+        for name, R_VS in filtered.R_VS.items()
+    }
+    names = tuple(problem.model.lengths)
+    A = np.zeros((len(samples), 3, len(names)))
+    for loop, span in observations.spans():
+        for part in loop.parts if isinstance(loop, Loop) else ():
+            A[span] += Rotation.from_quat(quat_WL[part.segment][span]).as_matrix() @ np.array(part.by_length)
+    E, d, d_cov = _state_constraints(problem)
+    # ℓ = E⁺ d + Z z, where Z spans what E leaves free
+    rows, Z, pinv = A.reshape(-1, len(names)), null_space(E), np.linalg.pinv(E)
+    z, _, rank, _ = np.linalg.lstsq(rows @ Z, -rows @ (pinv @ d), rcond=LEAST_EFFECT)
+    lengths, advice = pinv @ d + Z @ z, "check that the hands do in the phase what the protocol says, and every mount"
+    if rank < Z.shape[1]:
+        raise NoSolution(f"{recording.where()}: the motion does not determine the lengths; {advice}")
+    if np.min(lengths) < MIN_LENGTH:
+        shortest = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
+        raise NoSolution(f"{recording.where()}: the gap is least with {shortest}; {advice}")
+    gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in names]
+    correlated = count_correlated_samples(gaps, min_correlation(observations))  # samples that make one independent one
+    variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
+    by_z = Z @ np.linalg.solve(Z.T @ rows.T @ rows @ Z, Z.T)
+    by_d = (np.eye(len(names)) - by_z @ rows.T @ rows) @ pinv
+    covariance = correlated * variance * by_z + by_d @ d_cov @ by_d.T
+    others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
+    subject = replace(  # what the prior knows of mounts stays
+        prior,
+        name=recording.name,
+        lengths=dict(zip(names, lengths.tolist(), strict=True)),
+        order=(*names, *(prior.order[k] for k in others)),
+        covariance=block_diag(0.5 * (covariance + covariance.T), prior.covariance[np.ix_(others, others)]),
+        note=f"{problem.protocol.title}, lengths alone as in the paper; scale measured: "
+        f"{', '.join(problem.scale_lengths)}",
+    )
+    return Calibration(
+        problem=problem,
+        subject=subject.fix_girdles(problem.model.table),
+        effective_sample_size=len(gaps) / correlated,
+        scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
+        remarks=(*filtered.diagnostics, *mount_diagnostics),
+        time=recording.time[samples],
+        gap=np.linalg.norm(gaps, axis=1),
+        prior_gap=np.linalg.norm(prior_gaps, axis=1),
+        contact=np.ones(len(gaps)),
+        quat_WL=quat_WL,
+        measured_lengths={  # beside the prior alone: the gap is least without any length
+            name: MeasuredLength(metres, prior.lengths[name], prior.std(name), std)
+            for name, (metres, std) in problem.measured.items()
+        },
+        formulation="paper",
+    )
+
+
 def _check_problem(problem: CalibrationProblem) -> None:
-    """Raise `BadOption` for another start pose, other conditions, or a scale that was not measured."""
     protocol, start_pose = problem.protocol, problem.recording.start_pose
     if start_pose != NEUTRAL_POSE:
         raise BadOption(
@@ -65,137 +133,19 @@ def _check_problem(problem: CalibrationProblem) -> None:
         )
 
 
-def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
-    """The calibration with the lengths as the only unknowns.
-
-    Raises
-    ------
-    BadOption
-        What `_check_problem` refuses.
-    BadSession
-        A mount that is not known, or that gravity contradicts.
-    NoSolution
-        The gap does not determine the lengths.
-    """
-    _check_problem(problem)
-    recording, filtered, protocol, prior = problem.recording, problem.filtered, problem.protocol, problem.prior
-    mounts, headings, mount_diagnostics = align_sensors(recording, prior, filtered.R_VS_start, filtered.start)
-    observations, samples = problem.observe()
-    quat_WL = {
-        name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
-        for name, R_VS in filtered.R_VS.items()
-    }
-    A = compute_gap_matrices(observations, quat_WL)
-    constraints = _state_constraints(problem)
-    try:
-        lengths = _minimise(A, constraints, tuple(problem.model.lengths))
-    except NoSolution as error:
-        raise NoSolution(
-            f"{recording.where()}: {error}; check that the hands do in the phase what the protocol says, and that "
-            f"every mount is as the session states"
-        ) from error
-    gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in problem.model.lengths]
-    correlated = count_correlated_samples(gaps, min_correlation(observations))
-    covariance = _estimate_covariance(A, gaps, constraints, correlated)
-    gap, prior_gap = (np.linalg.norm(vectors, axis=1) for vectors in (gaps, prior_gaps))
-    names = tuple(problem.model.lengths)
-    others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
-    subject = replace(  # what the prior knows of mounts stays
-        prior,
-        name=recording.name,
-        lengths=dict(zip(names, lengths.tolist(), strict=True)),
-        order=(*names, *(prior.order[k] for k in others)),
-        covariance=block_diag(covariance, prior.covariance[np.ix_(others, others)]),
-        note=f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(problem.scale_lengths)}",
-    )
-    return Calibration(
-        problem=problem,
-        subject=subject.fix_girdles(problem.model.table),
-        effective_sample_size=len(gap) / correlated,
-        scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
-        remarks=(*filtered.diagnostics, *mount_diagnostics),
-        time=recording.time[samples],
-        gap=gap,
-        prior_gap=prior_gap,
-        contact=np.ones(len(gap)),
-        quat_WL=quat_WL,
-        measured_lengths={  # beside the prior alone: the gap is least without any length
-            name: MeasuredLength(metres, prior.lengths[name], prior.std(name), std)
-            for name, (metres, std) in problem.measured.items()
-        },
-        formulation="paper",
-    )
-
-
-def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
-    """A (n, 3, 8) of each sample, from segment orientations (n, 4) xyzw: the gap [m] in W is ``A @ lengths``."""
-    A = np.zeros((len(observations), 3, len(observations.layout.lengths)))
-    for loop, span in observations.spans():
-        assert isinstance(loop, Loop)
-        for part in loop.parts:
-            A[span] += Rotation.from_quat(quat_WL[part.segment][span]).as_matrix() @ np.array(part.by_length)
-    return A
-
-
-class _Constraints(NamedTuple):
-    """E ℓ = d."""
-
-    E: np.ndarray  # (m, 8)
-    d: np.ndarray  # (m,)
-    covariance: np.ndarray  # (m, m) of d
-
-
-def _state_constraints(problem: CalibrationProblem) -> _Constraints:
-    """Return measured lengths, and the population's proportions and lengths where the gap shows none."""
+def _state_constraints(problem: CalibrationProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return E (m, k), d (m,) and its covariance (m, m): measured lengths, and what only the population tells."""
     groups = group_lengths(problem.conditions, problem.model.lengths).values()
     names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
-    unit = dict(zip(names, np.eye(len(names)), strict=True))
-    assumed = []
-    for group in groups:
+    unit, assumed = dict(zip(names, np.eye(len(names)), strict=True)), list[np.ndarray]()
+    for group in groups:  # proportions
         shares = [unit[name] / prior.lengths[name] for name in group if name not in measured]
         assumed += [a - b for a, b in pairwise(shares)]
     assumed += [unit[name] for name in names if name not in {*measured, *(n for group in groups for n in group)}]
     E_assumed = np.array(assumed).reshape(-1, len(names))
-    return _Constraints(
+    d_assumed, cov_assumed = E_assumed @ [prior.lengths[n] for n in names], prior.lengths_covariance(names)
+    return (
         np.vstack([[unit[name] for name in measured], E_assumed]),
-        np.concatenate([[metres for metres, _ in measured.values()], E_assumed @ [prior.lengths[n] for n in names]]),
-        block_diag(
-            np.diag([std**2 for _, std in measured.values()]),
-            E_assumed @ prior.lengths_covariance(names) @ E_assumed.T,
-        ),
+        np.concatenate([[metres for metres, _ in measured.values()], d_assumed]),
+        block_diag(np.diag([std**2 for _, std in measured.values()]), E_assumed @ cov_assumed @ E_assumed.T),
     )
-
-
-def _minimise(A: np.ndarray, constraints: _Constraints, names: tuple[str, ...]) -> np.ndarray:
-    """The lengths ℓ = E⁺ d + Z z (8,) [m] that make the gaps least, where Z spans what E leaves free.
-
-    Raises
-    ------
-    NoSolution
-        The gaps do not determine the lengths, or are least with one that nobody has.
-    """
-    rows, Z = A.reshape(-1, A.shape[-1]), null_space(constraints.E)
-    stated = np.linalg.pinv(constraints.E) @ constraints.d
-    z, _, rank, _ = np.linalg.lstsq(rows @ Z, -rows @ stated, rcond=LEAST_EFFECT)
-    if rank < Z.shape[1]:
-        raise NoSolution("the motion does not determine the lengths: the gap does not change with some of them")
-    lengths = stated + Z @ z
-    if np.min(lengths) < MIN_LENGTH:
-        shortest = int(np.argmin(lengths))
-        raise NoSolution(f"the gap is least with {names[shortest]} = {1e3 * lengths[shortest]:.0f} mm")
-    return np.asarray(lengths)
-
-
-def _estimate_covariance(A: np.ndarray, gaps: np.ndarray, constraints: _Constraints, correlated: float) -> np.ndarray:
-    """Covariance (8, 8) [m²] of the lengths from the gaps' scatter and the constraints' errors.
-
-    Parameters
-    ----------
-    correlated : samples that make one independent one
-    """
-    rows, Z = A.reshape(-1, A.shape[-1]), null_space(constraints.E)
-    variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
-    by_z = Z @ np.linalg.solve(Z.T @ rows.T @ rows @ Z, Z.T)
-    by_d = (np.eye(len(by_z)) - by_z @ rows.T @ rows) @ np.linalg.pinv(constraints.E)
-    covariance = correlated * variance * by_z + by_d @ constraints.covariance @ by_d.T
-    return 0.5 * (covariance + covariance.T)

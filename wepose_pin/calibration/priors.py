@@ -110,7 +110,7 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
     else:
         of_mount = np.eye(3) / MEASURED_ORIENTATION_STD**2
     turn = Rotation.from_rotvec([0.0, 0.0, heading])
-    misfit = (turn * problem.filtered.R_VS_start[segment] * Rotation.from_quat(mount).inv()).as_rotvec()
+    misfit = (turn * problem.filtered.R_VS_start[segment] * mount.inv()).as_rotvec()
     signs = np.diag([-1.0, -1.0, 1.0])
     both = information + signs @ of_mount @ signs
     target = information @ mean - signs @ of_mount @ np.append(misfit[:2], 0.0)

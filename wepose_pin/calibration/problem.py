@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import BodyModel, list_breadths
+from ..body import BodyModel
 from ..body.mounts import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadPhase, BadSession
+from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
 from ..observations.directions import Pointing
 from ..observations.hinges import find_hinges
 from ..observations.joint_accelerations import find_neighbours
 from ..observations.paths import find_girdles
 from ..recording import Intervals, Recording, format_span
-from .conditions import Constraint, Loop, Moving, group_lengths, resolve_conditions
+from .conditions import Constraint, Loop, group_lengths, resolve_conditions
 from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations
@@ -65,10 +65,7 @@ class CalibrationProblem:
         BadSession
             A closure between points that no sensor determines.
         """
-        try:
-            return resolve_conditions(self.protocol, self.model, self.start_pose, self.filtered.R_VS)
-        except BadSession as error:
-            raise BadSession(f"{self.recording.where()}: {error}") from error
+        return resolve_conditions(self.protocol, self.model, self.start_pose, self.recording)
 
     @cached_property
     def lengths_in_closures(self) -> tuple[str, ...]:
@@ -85,8 +82,9 @@ class CalibrationProblem:
     @cached_property
     def couplings(self) -> list[Coupling]:
         """The relative headings of neighbours by the acceleration of the joint between them."""
-        pairs = find_neighbours(self.model, self.sensors)
-        return estimate_couplings(self.recording, self.filtered, pairs, self.moving_intervals)
+        moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
+        spans = [span for condition in moving for span in self.intervals(condition)]
+        return estimate_couplings(self.recording, self.filtered, find_neighbours(self.model, self.sensors), spans)
 
     def intervals(self, condition: Condition) -> Intervals:
         """Return the intervals [s] in which a condition holds.
@@ -102,22 +100,14 @@ class CalibrationProblem:
         return ((begin, min(begin + FREE_S, float(self.recording.time[-1]))),)
 
     @property
-    def moving_intervals(self) -> list[tuple[float, float]]:
-        """The intervals [s] of closures and of free motion."""
-        moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
-        return [span for condition in moving for span in self.intervals(condition)]
-
-    @property
     def measured_example(self) -> str:
-        """The measurement that would fix the scale best, as ``name=metres``: the protocol's, else the longest length in
+        """The measurement that would fix the scale best, as ``name=metres``: the protocol's, then the longest length in
         a closure that was not measured.
         """
-        example = self.protocol.measured_example
-        breadth = list_breadths(self.model.table).get(example.partition("=")[0])
         names = [name for name in self.lengths_in_closures if name not in self.measured]
-        if not names or (example and not (breadth and breadth.length in self.measured)):
-            return example
-        longest = max(names, key=lambda name: self.model.lengths[name])
+        if not names or (self.protocol.measured_example and not self.measured):
+            return self.protocol.measured_example
+        longest = max(names, key=self.model.lengths.__getitem__)
         return f"{longest}={self.model.lengths[longest]:.3f}"
 
     @cached_property
@@ -127,19 +117,16 @@ class CalibrationProblem:
         for condition in self.conditions:
             if isinstance(condition, Loop):
                 used |= {part.segment for part in condition.parts}
-            elif isinstance(condition, Moving):
-                used |= set(condition.segments)
+            elif isinstance(condition, FreeMotion):
+                used |= set(self.filtered.R_VS)
             else:
-                used |= {condition.segment}
-                used |= {condition.reference} if isinstance(condition, Pointing) else set()
+                used |= {condition.segment, condition.reference if isinstance(condition, Pointing) else ""}
         return tuple(name for name in self.model.table.segments if name in used)
 
-    def mount(self, segment: str) -> np.ndarray | None:
-        """Return the mount (4,) xyzw of prior or session, with an L that equals W in the start pose; None: unknown."""
-        mount = find_nominal_mount(self.recording, segment, self.prior)
-        if mount is None or segment not in self.prior.mounts or self.recording.remounted:
-            return mount  # a stated mount is by the sensor's axes in the start pose
-        return (self.start_rotation(segment) * Rotation.from_quat(mount)).as_quat()
+    def mount(self, segment: str) -> Rotation | None:
+        """Return the mount of prior or session, with an L that equals W in the start pose; None: unknown."""
+        mount = find_nominal_mount(self.recording, segment, self.prior, self.start_pose)
+        return None if mount is None else self.start_pose.to_world(segment, Rotation.from_quat(mount))
 
     def start_rotation(self, segment: str) -> Rotation:
         """Return R_WL of a segment in the start pose; L is the segment's frame."""
@@ -148,18 +135,13 @@ class CalibrationProblem:
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
         """Return segment → ψ [rad] by its mount, of those of these segments whose mount is known."""
         mounts = {segment: self.mount(segment) for segment in segments}
-        return {
-            segment: compute_heading_offset(self.filtered.R_VS_start[segment], Rotation.from_quat(mount))
-            for segment, mount in mounts.items()
-            if mount is not None
-        }
+        R_VS_start = self.filtered.R_VS_start
+        return {k: compute_heading_offset(R_VS_start[k], mount) for k, mount in mounts.items() if mount is not None}
 
     def remove_mounts(self, segments: Collection[str]) -> CalibrationProblem:
         """Return the same problem without the mounts of these segments."""
-        sensors = {
-            name: replace(sensor, stated_quat_LS=None) if name in segments else sensor
-            for name, sensor in self.recording.sensors.items()
-        }
+        sensors = dict(self.recording.sensors)
+        sensors |= {name: replace(sensors[name], stated_quat_LS=None) for name in segments}
         mounts = {name: mount for name, mount in self.prior.mounts.items() if name not in segments}
         recording, prior = replace(self.recording, sensors=sensors), replace(self.prior, mounts=mounts)
         return replace(self, recording=recording, prior=prior)
@@ -171,21 +153,21 @@ class CalibrationProblem:
         ----------
         estimated : segment → `quat_LS` by the motion, which contradicts them instead
         """
-        limit, variant = (MAX_MOUNT_ERROR_DEG, "unused") if estimated is None else (MOUNT_WARNING_DEG, "unused motion")
-        facts: dict[str, float | str] = {"variant": variant}
+        limit = float(np.deg2rad(MAX_MOUNT_ERROR_DEG if estimated is None else MOUNT_WARNING_DEG))
         unused = []
         for name in self.recording.imus:
             mount = self.mount(name)
             if mount is None or (estimated is not None and name not in estimated):
                 continue
             if estimated is None:
-                up_V = (self.filtered.R_VS_start[name] * Rotation.from_quat(mount).inv()).apply([0.0, 0.0, 1.0])
+                up_V = (self.filtered.R_VS_start[name] * mount.inv()).apply([0.0, 0.0, 1.0])
                 angle = float(np.arccos(np.clip(up_V[2], -1.0, 1.0)))
             else:
                 R_estimated = self.start_rotation(name) * Rotation.from_quat(estimated[name])
-                angle = float((R_estimated * Rotation.from_quat(mount).inv()).magnitude())
-            if angle > np.deg2rad(limit):
-                unused.append(Diagnostic("mount-contradicted", WARNING, name, angle, float(np.deg2rad(limit)), facts))
+                angle = float((R_estimated * mount.inv()).magnitude())
+            if angle > limit:
+                facts = {"variant": "unused"}
+                unused.append(Diagnostic("mount-contradicted", WARNING, name, angle, limit, facts))
         problem = self.remove_mounts([each.place for each in unused])
         return replace(problem, unused_mounts=(*self.unused_mounts, *unused))
 
@@ -215,9 +197,24 @@ class CalibrationProblem:
         return quat_WL
 
     @cached_property
+    def phase_samples(self) -> list[np.ndarray]:
+        """The numbers of the samples of each condition's phase."""
+        return [find_samples(self.recording, self.intervals(condition)) for condition in self.protocol.conditions]
+
+    @cached_property
     def connected(self) -> ConnectedSamples:
         """The samples at which no sensor has lost its heading since the start pose."""
         return find_connected(self.recording, self.filtered.start, self.sensors)
+
+    def diagnose_losses(self) -> list[Diagnostic]:
+        """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
+        diagnostics, lost = [], self.connected.lost
+        for condition, phase in zip(self.protocol.conditions, self.phase_samples, strict=True):
+            unused = float(np.sum(~self.connected.include(phase))) / self.recording.rate_hz
+            if unused:
+                facts = {"phase": _name_phase(condition), "interval": format_span(self.connected.loss)}
+                diagnostics.append(Diagnostic("samples-not-connected", WARNING, lost, unused, facts=facts))
+        return diagnostics
 
     def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[Observations, np.ndarray]:
         """Return the observations of all conditions, and the numbers (n,) of their samples in the recording.
@@ -227,11 +224,13 @@ class CalibrationProblem:
         BadPhase
             A condition has too few samples at which all sensors measure, connected with the start pose.
         """
-        recording, filtered = self.recording, self.filtered
-        phases = [find_samples(recording, self.intervals(condition)) for condition in self.protocol.conditions]
-        stride = max(1, round(recording.rate_hz / rate_hz), sum(map(len, phases)) // MOST_SAMPLES)
-        layout, parts, places = self._lay_out(), [], []
-        for condition, constraint, phase in zip(self.protocol.conditions, self.conditions, phases, strict=True):
+        recording, filtered, layout = self.recording, self.filtered, self._lay_out()
+        count = sum(map(len, self.phase_samples))
+        stride = max(1, round(recording.rate_hz / rate_hz), count // MOST_SAMPLES)
+        parts, places = [], []
+        for condition, constraint, phase in zip(
+            self.protocol.conditions, self.conditions, self.phase_samples, strict=True
+        ):
             samples = phase[::stride]
             samples = samples[mask_measured(recording, recording.sensors, samples) & self.connected.include(samples)]
             place = np.zeros((len(samples), 3))
@@ -258,9 +257,9 @@ class CalibrationProblem:
         rotations_since_start = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
-        condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         recorded = np.concatenate(places).T[: 3 * layout.recorded]
         data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
+        condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         names = tuple(condition.phase for condition in self.protocol.conditions)
         return Observations(layout, data, self.conditions, condition_index, names), samples
 
@@ -285,23 +284,6 @@ class CalibrationProblem:
             soft=tuple(name for name in sensors if any(segments[name].foam_std)),
             attitude_std=tuple(attitude_std),
         )
-
-    def diagnose_losses(self) -> list[Diagnostic]:
-        """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
-        diagnostics = []
-        for condition in self.protocol.conditions:
-            phase = find_samples(self.recording, self.intervals(condition))
-            unused = float(np.sum(~self.connected.include(phase))) / self.recording.rate_hz
-            if unused:
-                facts: dict[str, float | str] = {
-                    "phase": _name_phase(condition),
-                    "seconds": len(phase) / self.recording.rate_hz,
-                    "start": self.connected.loss[0],
-                    "end": self.connected.loss[1],
-                }
-                lost = self.connected.lost
-                diagnostics.append(Diagnostic("samples-not-connected", WARNING, lost, unused, facts=facts))
-        return diagnostics
 
 
 def _name_phase(condition: Condition) -> str:

@@ -53,7 +53,6 @@ class Closure(NamedTuple):
     slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
     at, at_std : (3,) [m] the fixed point in W, and its standard deviation, where it is known
     origin : the point from which a recorded place or the fixed point is counted; empty: the root
-    in_front_of : segment behind which a person does not bring the points; empty: they may be anywhere
     """
 
     phase: str
@@ -63,7 +62,6 @@ class Closure(NamedTuple):
     at: Annotated[tuple[float, float, float] | None, Key("at", "m", -100.0, 100.0)] = None
     at_std: Annotated[float, Key("at_std", "m", 1e-5, 1.0)] = 0.005
     origin: str = ""
-    in_front_of: str = ""
 
     @property
     def rows(self) -> int:
@@ -149,7 +147,6 @@ class Protocol:
                 if point not in table.points:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
-        named += [closure.in_front_of for closure in self.closures if closure.in_front_of]
         check_segments(table, (*named, *self.needs), where, BadOption)
         measured = self.measured_example.partition("=")[0]
         if measured and measured not in (*table.lengths, *list_breadths(table)):

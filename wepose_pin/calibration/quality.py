@@ -1,8 +1,8 @@
 """The quality of a calibration.
 
 Each check is one number against two limits: up to the first it passes, up to the second it is poor, beyond it fails.
-The quality is the worst of them. The cause of an uncertainty is the part of the motion that was too small: the upper
-arms were hardly raised, the torso hardly leaned.
+The quality is the worst of them. The cause of an uncertainty is a motion that was too small: of the limbs, or of the
+torso.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from dataclasses import replace
 from typing import get_args
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..body.subject import Quality
 from ..body.table import ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences
-from ..recording import format_span, format_time
-from .anatomy import LEAST_ROTATION, diagnose_labels, measure_limbs, measure_rotation, reach_limbs
+from ..recording import format_span
+from .alternatives import LEAST_ROTATION, measure_doubt, measure_rotations
 from .conditions import group_lengths, is_scale_observed
 from .result import MIN_CONTACT, Calibration, CalibrationQuality, Check, QualityLimits
 from .weights import CONTRADICTED
@@ -52,35 +51,29 @@ POSED = QualityLimits(CONTRADICTED, 8.0)  # of a pose or a bow that is used, fro
 MEASURED = QualityLimits(CONTRADICTED, 5.0)  # of a measured length from the estimate without it
 SAMPLES = QualityLimits(6.0, 2.0)  # effective sample size, at least
 ROTATION = QualityLimits(LEAST_ROTATION, 0.0)  # [rad] of the segments, at least
-DOUBT = QualityLimits(1.0, 1.0)  # of anatomy, see `anatomy`
-
-# A motion smaller than this [rad] is the cause of an uncertainty.
-ENOUGH = {
-    "elevation": np.deg2rad(40.0),
-    "sideways": np.deg2rad(35.0),
-    "bend": np.deg2rad(40.0),
-    "lean": np.deg2rad(8.0),
-    "twist": np.deg2rad(12.0),
-}
-ENOUGH_SAMPLES = 12.0  # effective sample size that a minute of motion reaches
+DOUBT = QualityLimits(1.0, 1.0)  # of the limbs' motion, `measure_doubt`
+# A motion smaller than this is the cause of an uncertainty: rms angle [rad] of the torso, or of the segment of a limb
+# that turned least; effective sample size, of which a minute reaches 18.
+ENOUGH_SPINE, ENOUGH_LIMBS = np.deg2rad(8.0), np.deg2rad(20.0)
+ENOUGH_SAMPLES = 12.0
 
 
 def assess(calibration: Calibration) -> CalibrationQuality:
     """Return the quality of a calibration."""
-    problem, limbs, rotation = calibration.problem, measure_limbs(calibration), measure_rotation(calibration)
+    problem, rotations = calibration.problem, measure_rotations(calibration)
     is_mechanism, checks = problem.model.table.is_mechanism, list[Check]()
     if not is_mechanism:
-        checks.append(_check(diagnose_labels(calibration, limbs.contradiction), DOUBT))
+        checks.append(_check(_diagnose_labels(calibration), DOUBT))
     for mount in problem.unused_mounts:
         checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
     if not problem.protocol.closures:  # nothing tells which of them is wrong
         for phase, deviation in calibration.posed.items():
             checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
     if not calibration.exchanged:  # with exchanged sensors all other checks are meaningless
-        motion = _measure_motion(calibration, limbs.flexion)
-        checks += _check_lengths(calibration, motion) + _check_headings(calibration, motion)
+        checks += _check_lengths(calibration, rotations) + _check_headings(calibration, rotations)
         checks += _check_residuals(calibration)
-    if rotation < LEAST_ROTATION and not is_mechanism and any(check.quality == "fail" for check in checks):
+    rotation = float(np.median([*rotations.values()])) if rotations and not is_mechanism else np.inf
+    if rotation < LEAST_ROTATION and any(check.quality == "fail" for check in checks):
         # All that fails follows from it.
         hardly_any = Diagnostic("motion-too-small", INFO, value=rotation, facts={"variant": "soft-tissue"})
         checks = [_check(hardly_any, ROTATION, quality="fail")]
@@ -102,6 +95,16 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     )
 
 
+def _diagnose_labels(calibration: Calibration) -> Diagnostic:
+    """Return the sensors that sit on other segments, or else by how much the limbs move as a person's cannot."""
+    (doubt, joint), order = measure_doubt(calibration), list(calibration.problem.model.table.segments)
+    pairs = {tuple(sorted(pair, key=order.index)) for pair in calibration.exchanged.items()}
+    if not pairs:
+        return Diagnostic("limb-motion-implausible", ERROR, joint, doubt)
+    place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
+    return Diagnostic("sensors-exchanged", ERROR, place, doubt, facts={"variant": "sides"} if len(pairs) > 1 else {})
+
+
 def _check(
     diagnostic: Diagnostic, limits: QualityLimits, cause: Diagnostic | None = None, quality: Quality | None = None
 ) -> Check:
@@ -113,7 +116,7 @@ def _check(
     return Check(diagnostic, quality, limits, None if cause is None else replace(cause, severity=severity))
 
 
-def _check_lengths(calibration: Calibration, motion: Mapping[str, float]) -> list[Check]:
+def _check_lengths(calibration: Calibration, rotations: Mapping[str, float]) -> list[Check]:
     """Checks of the lengths that rotate together in a closure, and of the scale where no closure shows it."""
     problem, subject, checks = calibration.problem, calibration.subject, list[Check]()
     table, scale_observed = problem.model.table, is_scale_observed(problem.conditions)
@@ -128,32 +131,27 @@ def _check_lengths(calibration: Calibration, motion: Mapping[str, float]) -> lis
             take = np.isin(names, summed).astype(float)
             std = float(np.sqrt(max(take @ shape @ take, 0.0)))
             uncertain = Diagnostic("length-uncertain", INFO, " + ".join(summed), std)
-            checks.append(_check(uncertain, LENGTH, _find_cause(calibration, motion, table.segments[sensor].spine)))
+            cause = _find_cause(calibration, rotations, table.segments[sensor].spine)
+            checks.append(_check(uncertain, LENGTH, cause))
     if not scale_observed:
-        facts = {"measured": problem.measured_example}
-        if not problem.scale_lengths:
-            facts |= {"variant": "prior", "prior": problem.prior.note or problem.prior.name}
-            facts |= {"protocol": problem.protocol.name}
+        facts: dict[str, float | str] = {"measured": problem.measured_example}
         checks.append(_check(Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts), SCALE))
+    contradicted = False
     for name, length in calibration.measured_lengths.items():
-        measured: dict[str, float | str] = {"measured": length.metres, "expected": length.expected, "std": length.std}
-        if calibration.formulation == "paper":
-            measured["variant"] = "paper"
-        contradicted = Diagnostic("length-contradicted", INFO, name, length.deviation, facts=measured)
-        checks.append(_check(contradicted, MEASURED))
-    prior = problem.prior
-    if table.is_mechanism or any(check.quality != "pass" for check in checks if check.limits == MEASURED):
-        return checks  # all lengths have followed a wrong measured one
+        facts = {"measured": length.metres, "expected": length.expected, "std": length.std}
+        checks.append(_check(Diagnostic("length-contradicted", INFO, name, length.deviation, facts=facts), MEASURED))
+        contradicted |= checks[-1].quality != "pass"
     others = [name for name in subject.lengths if name not in problem.measured]
-    if others:
+    if others and not contradicted and not table.is_mechanism:  # all lengths follow a wrong measured one
+        prior = problem.prior
         z = {name: abs(subject.lengths[name] - prior.lengths[name]) / prior.std(name) for name in others}
         name = max(z, key=lambda n: z[n])
-        unusual: dict[str, float | str] = {"variant": "estimated", "metres": float(subject.lengths[name])}
-        checks.append(_check(Diagnostic("length-contradicted", INFO, name, z[name], facts=unusual), UNUSUAL))
+        facts = {"variant": "estimated", "metres": float(subject.lengths[name])}
+        checks.append(_check(Diagnostic("length-contradicted", INFO, name, z[name], facts=facts), UNUSUAL))
     return checks
 
 
-def _check_headings(calibration: Calibration, motion: Mapping[str, float]) -> list[Check]:
+def _check_headings(calibration: Calibration, rotations: Mapping[str, float]) -> list[Check]:
     """Checks of the mounts' headings; of a mechanism, its lengths alone tell."""
     subject, table, checks = calibration.subject, calibration.problem.model.table, list[Check]()
     for segment in () if table.is_mechanism else subject.mounts:
@@ -162,10 +160,8 @@ def _check_headings(calibration: Calibration, motion: Mapping[str, float]) -> li
             limits = TORSO_HEADING if spine else ARM_HEADING
             if table.segments[segment].rigid_without_sensor or len(calibration.hinge_rms) < 2:
                 limits = OTHER_HEADING
-            facts = {} if calibration.problem.protocol.closures else {"variant": "poses"}
-            std = subject.std(f"mounts.{segment}.z")
-            uncertain = Diagnostic("mount-heading-uncertain", INFO, segment, std, facts=facts)
-            checks.append(_check(uncertain, limits, _find_cause(calibration, motion, spine)))
+            uncertain = Diagnostic("mount-heading-uncertain", INFO, segment, subject.std(f"mounts.{segment}.z"))
+            checks.append(_check(uncertain, limits, _find_cause(calibration, rotations, spine)))
     return checks
 
 
@@ -174,7 +170,7 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
     checks, tilts = list[Check](), calibration.subject.start_pose_offset
     if calibration.problem.protocol.closures:
         share = float(np.mean(calibration.contact[calibration.closed] < MIN_CONTACT))
-        facts = {"intervals": format_longest(find_open_intervals(calibration))}
+        facts = {"intervals": format_longest(calibration.open_intervals)}
         checks += [
             _check(Diagnostic("closure-gap-large", INFO, value=calibration.rms_gap), GAP),
             _check(Diagnostic("motion-too-small", INFO, value=calibration.effective_sample_size), SAMPLES),
@@ -186,70 +182,21 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
     return checks
 
 
-def _find_cause(calibration: Calibration, motion: Mapping[str, float], spine: bool) -> Diagnostic | None:
-    """The cause of an uncertainty: the smallest of the motions that it needs, or too short a motion."""
-    if not calibration.problem.protocol.closures:
+def _find_cause(calibration: Calibration, rotations: Mapping[str, float], spine: bool) -> Diagnostic | None:
+    """The cause of an uncertainty: too small a motion of the torso or of the limbs, or too short a motion."""
+    table = calibration.problem.model.table
+    if not rotations:
         return None
-    parts = [name for name in (("lean", "twist") if spine else ("sideways", "elevation", "bend")) if name in motion]
-    least = min(parts, key=lambda name: motion[name] / ENOUGH[name], default="")
-    if least and motion[least] < ENOUGH[least]:
-        return Diagnostic("motion-too-small", WARNING, "", motion[least], float(ENOUGH[least]), {"variant": least})
+    own = [angle for name, angle in rotations.items() if table.segments[name].spine == spine]
+    variant, enough = ("spine", ENOUGH_SPINE) if spine else ("limbs", ENOUGH_LIMBS)
+    if own and min(own) < enough and not table.is_mechanism:
+        return Diagnostic("motion-too-small", WARNING, "", min(own), float(enough), {"variant": variant})
     if calibration.effective_sample_size < ENOUGH_SAMPLES:
         return Diagnostic("motion-too-small", WARNING, "", calibration.effective_sample_size, ENOUGH_SAMPLES)
     return None
 
 
-def _measure_motion(calibration: Calibration, flexion: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Return how far the body moved [rad] while the chain was closed, as `ENOUGH`; the least of its limbs."""
-    model, table = calibration.problem.model, calibration.problem.model.table
-    if table.is_mechanism:  # its links hang in no common pose
-        return {}
-    rows = calibration.touching if calibration.touching.any() else np.ones(len(calibration.time), dtype=bool)
-    R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
-    sizes: dict[str, list[float]] = {name: [] for name in ENOUGH}
-    reaches = reach_limbs(calibration, R)
-    for first, *_, last in table.draw.limbs:
-        segment = table.points[first].link
-        above = model.parents.get(segment)
-        if above in R and segment in R and last in reaches:
-            base = R[above].inv()
-            along = (base * R[segment]).apply(table.segments[segment].along)
-            sizes["elevation"].append(_range(np.arccos(np.clip(-along[:, 2], -1.0, 1.0))))
-            sizes["sideways"].append(_turn(base.apply(reaches[last])))
-    sizes["bend"] = [_range(angle) for angle in flexion.values()]
-    if table.reference in R:
-        up = R[table.reference].apply([0.0, 0.0, 1.0])
-        mean = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
-        sizes["lean"].append(float(np.percentile(np.arccos(np.clip(up @ mean, -1.0, 1.0)), 98)))
-        sizes["twist"].append(_turn(R[table.reference].apply([1.0, 0.0, 0.0])))
-    return {name: min(each) for name, each in sizes.items() if each}
-
-
-def _turn(v: np.ndarray) -> float:
-    """Range [rad] of the angles of v (n, 3) about z."""
-    turn = v[:, 0] + 1j * v[:, 1]
-    return _range(np.angle(turn * np.conj(np.mean(turn))))
-
-
-def _range(values: np.ndarray) -> float:
-    """From the 2nd to the 98th percentile."""
-    return float(np.ptp(np.percentile(values, (2, 98))))
-
-
-def find_open_intervals(calibration: Calibration) -> list[tuple[float, float]]:
-    """Intervals [s] in which the palms were apart."""
-    mask = np.isfinite(calibration.gap) & (calibration.contact < MIN_CONTACT)
-    return [(round(a, 3), round(b, 3)) for a, b in find_intervals(calibration.time, mask)]
-
-
-def find_intervals(time: np.ndarray, mask: np.ndarray) -> list[tuple[float, float]]:
-    """Intervals [s] in which `mask` (n,) bool holds, at times (n,) [s]."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.view(np.int8), [0]))))
-    return [(float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def format_longest(intervals: Sequence[tuple[float, float]]) -> str:
     """The text of the longest intervals [s], in the order of time."""
     longest = sorted(intervals, key=lambda interval: interval[0] - interval[1])[:MOST_INTERVALS]
-    rounded = [(round(a, 1) + 0.0, round(b, 1) + 0.0) for a, b in sorted(longest)]  # without a negative zero
-    return ", ".join(f"{format_time(a)} s" if a == b else format_span((a, b)) for a, b in rounded)
+    return ", ".join(format_span(np.round(interval, 1) + 0.0) for interval in sorted(longest))  # no negative zero

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..body.subject import Quality, Subject
 from ..diagnostics import Diagnostic, notebook_html, render
+from ..recording.gaps import find_runs
 from .problem import CalibrationProblem
 
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
@@ -61,6 +62,11 @@ class Check(NamedTuple):
         passes, poor = self.limits
         value, limit = (passes, self.value) if passes > poor else (self.value, passes)
         return value / max(limit, 1e-9)
+
+
+def find_intervals(time: np.ndarray, mask: np.ndarray) -> list[tuple[float, float]]:
+    """Intervals [s] in which `mask` (n,) bool holds, at times (n,) [s]."""
+    return [(float(time[first]), float(time[last - 1])) for first, last in find_runs(mask)]
 
 
 @dataclass(frozen=True)
@@ -122,6 +128,12 @@ class Calibration:
     def touching(self) -> np.ndarray:
         """(n,) bool: samples at which the palms touch."""
         return self.closed & (self.contact > MIN_CONTACT)
+
+    @property
+    def open_intervals(self) -> list[tuple[float, float]]:
+        """Intervals [s] in which the palms were apart."""
+        mask = self.closed & (self.contact < MIN_CONTACT)
+        return [(round(a, 3), round(b, 3)) for a, b in find_intervals(self.time, mask)]
 
     @property
     def rms_gap(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +13,14 @@ from ..body.soft_tissue import estimate_scatter
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import NoSolution
-from .ambiguity import include_other_minima
-from .conditions import Loop, Moving, is_scale_observed
+from .conditions import Loop, is_scale_observed
 from .couplings import add_couplings
 from .equations import GAP_ROWS, HINGE_STD, Layout
-from .initial_headings import search_headings
-from .least_squares import MIN_LENGTH, Estimate, Gaussian
+from .initial_headings import search_headings, wrap_angle
+from .least_squares import MIN_LENGTH, Estimate, Gaussian, LeastSquares, solve
 from .priors import build_prior, place_points
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
+from .protocols import FreeMotion
 from .result import Calibration
 from .weights import (
     CONTRADICTED,
@@ -34,6 +34,11 @@ from .weights import (
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
 MOST_LAG_STD = 0.15  # [rad/rad] from which on the motion does not show how far a sensor lags behind a twist
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
+
+COMPARED_SAMPLES = 120  # on which solutions are compared
+COMPARED_STEPS = 25
+LEAST_WEIGHT = 1e-4  # of a solution that counts: its probability over that of the best one
+NEAR = 3.0  # standard deviations within which two solutions are the same
 
 
 def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibration:
@@ -79,29 +84,81 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
     return replace(calibration, remarks=(*calibration.remarks, *ambiguous))
 
 
+def include_other_minima(
+    result: WeightedFit, covariance: np.ndarray, headings: np.ndarray, prior_at: Callable[[np.ndarray], Gaussian]
+) -> tuple[np.ndarray, list[Diagnostic]]:
+    """Return the covariance (m, m) about the solution with other minima included, and what to say of them.
+
+    A covariance describes one minimum. Where the hands hardly move, the closure has several: one arm's headings turned
+    by 118 deg close the chain as well. Each is solved and weighted by how much worse it explains all that is known.
+
+    Parameters
+    ----------
+    result, covariance : the best solution
+    headings : (k, sensors) [rad] of the other minima, the lowest first
+    prior_at : headings (sensors,) → what is known without the closure; those without a stated mount are its mean
+    """
+    fit, (observations, _, weights) = result.fit, result.fit.problem
+    rows = observations.layout.heading
+    if not observations.closed.any():
+        return covariance, []
+    stride = max(1, len(observations) // COMPARED_SAMPLES)
+    few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
+    some, weights = observations.take(few), stride * weights[few]
+
+    def solve_from(psi: np.ndarray) -> Estimate:
+        start = fit.x.copy()
+        start[rows] += wrap_angle(psi - start[rows])
+        start = place_points(start, some)
+        return solve(LeastSquares(some, prior_at(start[rows]), weights), start, COMPARED_STEPS, strict=False)
+
+    best, std = solve_from(fit.x[rows]), np.sqrt(np.diag(fit.covariance)[rows])
+    # The residuals' variance is estimated from the effective samples: Student's t, not a Gaussian.
+    degrees = max(3.0 * result.effective_sample_size, 1.0)
+    offsets, likelihoods = [np.zeros_like(fit.x)], [1.0]
+    for other in map(solve_from, headings):
+        offset = other.x - best.x
+        offset[rows] = wrap_angle(offset[rows])
+        likelihood = float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees))
+        if likelihood > LEAST_WEIGHT and all(np.abs((offset - o)[rows] / std).max() > NEAR for o in offsets):
+            offsets.append(offset)
+            likelihoods.append(likelihood)
+    if len(offsets) == 1:
+        return covariance, []
+    shares = np.array(likelihoods) / sum(likelihoods)
+    turned = np.abs(offsets[1 + int(np.argmax(shares[1:]))][rows])
+    worst = int(np.argmax(turned))
+    ambiguous = Diagnostic("headings-ambiguous", WARNING, observations.layout.sensors[worst], float(turned[worst]))
+    return covariance + np.einsum("k,ki,kj->ij", shares, offsets, offsets), [ambiguous]
+
+
 def _describe(problem: CalibrationProblem, samples: np.ndarray, result: WeightedFit, x_cov: np.ndarray) -> Calibration:
     """Return the calibration that a solution at samples (n,) makes, with the covariance (m, m) of x."""
-    fit, observations = result.fit, result.fit.problem.observations
+    fit, observations, prior = result.fit, result.fit.problem.observations, problem.prior
     layout = observations.layout
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
-    scale_observed = is_scale_observed(problem.conditions)
-    scale = "of the population prior" if problem.prior.is_population else f"of {problem.prior.name}"
-    if problem.scale_lengths or scale_observed:
-        scale = f"measured: {', '.join(problem.scale_lengths)}" if problem.scale_lengths else "of the closure"
+    scale = "of the population prior" if prior.is_population else f"of {prior.name}"
+    if problem.scale_lengths:
+        scale = f"measured: {', '.join(problem.scale_lengths)}"
+    elif is_scale_observed(problem.conditions):
+        scale = "of the closure"
     hinges = _estimate_hinges(problem, fit, x_cov)
     scatter = estimate_scatter([hinge.std for hinge, _ in hinges.values()])
-    subject = _make_subject(problem, fit, x_cov, scatter)
-
+    subject = replace(
+        _make_subject(problem, fit, x_cov, scatter),
+        hinges={joint: hinge for joint, (hinge, _) in hinges.items()},
+        note=f"{problem.protocol.title}; scale {scale}",
+    )
     prior_x = fit.x.copy()
-    prior_x[layout.length] = [problem.prior.lengths[name] for name in layout.lengths]
+    prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
     gap, prior_gap = (
         np.where(observations.closed, np.linalg.norm(gaps, axis=1), np.nan)
         for gaps in (fit.gaps, observations.gaps(place_points(prior_x, observations)))
     )
     diagnostics = [*problem.filtered.diagnostics, *problem.diagnose_losses()]
     if not problem.protocol.closures:
-        facts = {"protocol": problem.protocol.title, "prior": problem.prior.note or problem.prior.name}
+        facts = {"protocol": problem.protocol.title, "prior": prior.note or prior.name}
         diagnostics.append(Diagnostic("lengths-not-observed", INFO, facts=facts))
     for name in problem.filtered.R_VS:
         if name not in subject.mounts:
@@ -109,17 +166,11 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
             diagnostics.append(Diagnostic("mount-unknown", WARNING, name, facts=facts))
     for phase, deviation in result.posed.items() if observations.closed.any() else ():
         if deviation > CONTRADICTED:
-            variant: dict[str, float | str] = {"variant": "unused"}
-            unused = Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED, variant)
-            diagnostics.append(unused)
+            diagnostics.append(Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED))
     least_std = 0.0 if problem.model.table.is_mechanism else LEAST_LENGTH_STD
     return Calibration(
         problem=problem,
-        subject=replace(
-            subject,
-            hinges={joint: hinge for joint, (hinge, _) in hinges.items()},
-            note=f"{problem.protocol.title}; scale {scale}",
-        ),
+        subject=subject,
         effective_sample_size=result.effective_sample_size,
         scale_std=scale_std,
         remarks=tuple(diagnostics),
@@ -136,31 +187,30 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
 
 def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray, scatter: float) -> Subject:
     """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`TissueMean`)."""
-    filtered, layout, x = problem.filtered, fit.problem.observations.layout, fit.x
-    mounts, offsets, drifts = {}, {}, {}
-    std = np.sqrt(np.diag(x_cov))
-    for name, tilt, heading, drift in zip(layout.sensors, layout.tilt, layout.heading, layout.drift, strict=True):
-        start_W = Rotation.from_rotvec(-np.append(x[tilt], 0.0)) * Rotation.from_rotvec([0.0, 0.0, x[heading]])
-        mounts[name] = (problem.start_rotation(name).inv() * start_W * filtered.R_VS_start[name]).as_quat()
+    R_VS_start, layout, x = problem.filtered.R_VS_start, fit.problem.observations.layout, fit.x
+    std, R_WS_start, offsets, drifts = np.sqrt(np.diag(x_cov)), {}, {}, {}
+    headings = dict(zip(layout.sensors, x[layout.heading].tolist(), strict=True))
+    # The mounts of sensors outside the chain are those of the start pose.
+    headings |= problem.stated_headings([name for name in R_VS_start if name not in headings])
+    for name, psi in headings.items():
+        R_WS_start[name] = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start[name]
+    for name, tilt, drift in zip(layout.sensors, layout.tilt, layout.drift, strict=True):
+        R_WS_start[name] = Rotation.from_rotvec(-np.append(x[tilt], 0.0)) * R_WS_start[name]
         offset_std = np.minimum(std[tilt], np.pi)  # no angle is more uncertain than half a turn
         offsets[name] = StartPoseOffset(x[tilt], float(np.sqrt(np.mean(offset_std**2))))
         drifts[name] = HeadingDrift(float(x[drift]), float(std[drift]))
-    # The mounts of sensors outside the chain are those of the start pose.
-    for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
-        start_W = Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS_start[name]
-        mounts[name] = (problem.start_rotation(name).inv() * start_W).as_quat()
     order, covariance = _project_to_subject(problem, layout, x_cov, scatter)
+    girdles = {term.name: values for term, values in zip(layout.girdles, x[layout.girdle], strict=True)}
     return replace(
         problem.prior,
         name=problem.recording.name,
         start_pose_offset=offsets,
         heading_drift=drifts,
         lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
-        girdles=dict(problem.prior.girdles)
-        | {term.name: values for term, values in zip(layout.girdles, x[layout.girdle], strict=True)},
+        girdles={**problem.prior.girdles, **girdles},
         order=order,
         covariance=covariance,
-        mounts=mounts,
+        mounts={name: (problem.start_rotation(name).inv() * R_WS).as_quat() for name, R_WS in R_WS_start.items()},
     )
 
 
@@ -168,20 +218,19 @@ def _estimate_hinges(
     problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray
 ) -> Mapping[str, tuple[Hinge, float]]:
     """Joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
-    hinges, observations = {}, fit.problem.observations
-    layout = observations.layout
-    moving = [fit.residuals[span, GAP_ROWS:] for c, span in observations.spans() if isinstance(c, Loop | Moving)]
-    bending = np.concatenate([fit.residuals[:0, GAP_ROWS:], *moving])
+    layout, hinges = fit.problem.observations.layout, {}
+    spans = [span for c, span in fit.problem.observations.spans() if isinstance(c, Loop | FreeMotion)]
     lags = {
         twist.segment: float(fit.x[row])
         for twist, row in zip(layout.twists, layout.twist, strict=True)
         if x_cov[row, row] < MOST_LAG_STD**2
     }
     for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
-        if len(bending):
+        if spans:
             axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
             axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
-            rms = float(HINGE_STD * np.sqrt(np.mean(bending[:, k] ** 2)))
+            bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
+            rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
             std = max(rms, problem.model.table.hinges[term.name].softness)
             hinges[term.name] = Hinge(axis_L, std, lags.get(term.on)), rms
     return hinges

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..observations.directions import Level, Pointing
-from .conditions import Loop, Moving
+from .conditions import Loop
 from .couplings import LEAST_CORRELATION_S
 from .equations import GAP_ROWS, HINGE_STD, Layout
 from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve
+from .protocols import FreeMotion
 from .result import MIN_CONTACT, MeasuredLength
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
@@ -128,7 +129,7 @@ def _state_weights(observations: Observations, contact: np.ndarray, correlation:
     weights[:, :GAP_ROWS] *= contact[:, None]
     for condition, span in observations.spans():
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
-        size = ELBOW_STD / HINGE_STD if isinstance(condition, Moving) else 1.0
+        size = ELBOW_STD / HINGE_STD if isinstance(condition, FreeMotion) else 1.0
         if isinstance(condition, Level):  # by the sine of its bend an axis leaves the horizontal if it is off
             first = 4 * observations.layout.sensors.index(condition.segment)
             x, y, _, _ = observations.data[first : first + 4, span]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
-from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals, format_longest
+from ..calibration.quality import ENOUGH_SAMPLES, format_longest
 from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
 from .assignment import ShakeDetector
@@ -382,7 +382,7 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple
         sentence, actions = "This calibration must not be used.", [RESTART, MORE]
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
     begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
-    open_s = format_longest([(first - begin, last - begin) for first, last in find_open_intervals(calibration)])
+    open_s = format_longest([(first - begin, last - begin) for first, last in calibration.open_intervals])
     counted = [replace(d, facts={**d.facts, "intervals": open_s}) if "intervals" in d.facts else d for d in diagnostics]
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
     if calibration.exchanged:  # all other reasons follow from this one

@@ -102,7 +102,7 @@ def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: 
 
 
 def find_path(
-    model: BodyModel, start: StartPose, sensors: Collection[str], points: Collection[tuple[str, float]]
+    model: BodyModel, start: StartPose, sensors: Collection[str], points: Collection[tuple[str, float]], where: str = ""
 ) -> PointPath:
     """Find the path of a signed sum of points, its vectors by segments in the order of the table.
 
@@ -125,8 +125,8 @@ def find_path(
         if carrier is None:
             places = " and ".join(point for point, _ in points)
             raise BadSession(
-                f"sensors.{link} is missing: without it the place of {places} is not known; add it, or use a protocol "
-                f"without that point"
+                f"{where}sensors.{link} is missing: without it the place of {places} is not known; add it, or use a "
+                f"protocol without that point"
             )
         R = start.rotation(link)
         B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))

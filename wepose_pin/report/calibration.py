@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..body.kinematics import Pose
 from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration
-from ..calibration.quality import find_intervals
-from ..calibration.result import MIN_CONTACT
+from ..calibration.result import MIN_CONTACT, find_intervals
 from ..diagnostics import Diagnostic, lines
 from ..errors import WeposeError
 from ..filters import BEST
@@ -197,7 +196,7 @@ def _list_view(calibration: Calibration, recording: Recording, tracked: TrackRes
     if tracked is None:
         try:
             model, options = calibration.problem.model, TrackOptions(method)
-            tracker = Tracker(calibration.subject, model=model, options=options, with_point_cov=False)
+            tracker = Tracker(calibration.subject, model=model, options=options)
             tracked = tracker.push(recording) or next(tracker.smooth())
         except WeposeError as error:
             return [f"The motion cannot be tracked: {error}"]

@@ -12,7 +12,6 @@ from ..angles import AUTO, Angles, joint_angles, summary
 from ..body import BodyTable
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
-from ..tracking.error_budget import group_by_source
 from ..tracking.measures import (
     HeadingStd,
     Measures,
@@ -22,6 +21,7 @@ from ..tracking.measures import (
     find_samples_after_start,
     finite_max,
     finite_median,
+    group_by_source,
     has_stated_mounts,
     longest_run_s,
     measure_tips,

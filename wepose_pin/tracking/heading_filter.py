@@ -151,7 +151,7 @@ class HeadingFilter:
         self._last = start
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
-        self._closed_before = set[str]()  # phases whose points coincided in the last knot
+        self._clasped_before = False  # whether the palms were joined in the last knot
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ (k,) [rad] as known to within the start pose."""
@@ -218,7 +218,9 @@ class HeadingFilter:
     def _update(self, knot: Knot) -> Iterator[None]:
         """Update by a knot's observations."""
         k, unreliable = len(self.problem.names), knot.lost | self._lost_before  # after a loss the tilt may be wrong
-        inside = {phase: rows for phase, rows in knot.inside.items() if rows.any()}
+        palms = self.problem.palms if knot.clasped.any() else None
+        if palms is not None and unreliable[[self.problem.names.index(name) for name in palms.segments]].any():
+            palms = None
         x, information, misfits = self.x, Information(len(self.x)), self._misfits
         for _ in range(ITERATIONS):
             information = Information(len(x))
@@ -226,16 +228,14 @@ class HeadingFilter:
             self._add_biases(knot, x, information)
             yield
             yield from self._add_hinges(knot, x, information, unreliable)
-            for phase, rows in inside.items():
-                points = self.problem.closures[phase]
-                if not unreliable[[self.problem.names.index(name) for name in points.segments]].any():
-                    self._add_gap(phase, points.linearize(knot.quat_WL[rows], x[:k]), knot, information)
-                    yield
+            if palms is not None:
+                self._add_gap(palms.linearize(knot.quat_WL[knot.clasped], x[:k]), knot, information)
+                yield
             x = self._fuse(x, information)
             yield
         self._misfits = misfits
         self._apply(x, information)
-        self._closed_before = set(inside)
+        self._clasped_before = bool(knot.clasped.any())
 
     def _add_biases(self, knot: Knot, x: np.ndarray, information: Information) -> None:
         """Add what the orientation filters have learned of the biases about the vertical.
@@ -301,9 +301,10 @@ class HeadingFilter:
             information.add(columns[:2], rows.slope[:, None] * [1.0, -1.0], rows.excess, beyond)
             yield
 
-    def _add_gap(self, phase: str, rows: GapRows, knot: Knot, information: Information) -> None:
-        """Add a closure, without outliers; as many samples as its residuals are correlated over are one observation.
+    def _add_gap(self, rows: GapRows, knot: Knot, information: Information) -> None:
+        """Add the gap between the palms, without outliers.
 
+        As many samples as its residuals are correlated over are one observation.
         Causally all of a clasp's first knot is one: a clasp may be shorter than its residuals are correlated.
         """
         problem = self.problem
@@ -313,7 +314,7 @@ class HeadingFilter:
         r, H = (whiten @ rows.gap[:, :, None])[..., 0], whiten @ rows.H
         is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
         correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
-        if problem.causal and phase not in self._closed_before:
+        if problem.causal and not self._clasped_before:
             correlated = float(len(knot.quat_WL))
         r, H = r[is_inlier].ravel(), H[is_inlier].reshape(-1, H.shape[2])
         information.add(problem.columns.heading, H, r, 1.0 / correlated)

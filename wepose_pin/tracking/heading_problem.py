@@ -1,13 +1,14 @@
 """The problem of the heading filter: what observes the headings, the noise of that, and the states.
 
 δ (k,) [rad] are the heading errors of the k segments with sensors, on the left in W. Time is cut into intervals of
-equal length, the knots. Headings are observed by joints between two sensors, by hinges and by points that coincide
+equal length, the knots. Headings are observed by joints between two sensors, by hinges and by joined palms
 (`wepose_pin.observations`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -19,7 +20,7 @@ from ..body import BodyModel
 from ..body.mounts import compute_start_heading_var, find_mount_covariance
 from ..body.start_pose import StartPose
 from ..body.subject import Subject
-from ..calibration import PROTOCOLS, load_protocol
+from ..calibration import load_protocol
 from ..errors import BadSession
 from ..filters.noise import SensorNoise
 from ..observations.closures import PointPair
@@ -27,6 +28,7 @@ from ..observations.hinges import HingePlane, find_hinges
 from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
 from ..recording import Recording
 
+CLASP = "clasp"  # the phase in which the palms are joined, and its protocol
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
 MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption
 LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
@@ -68,7 +70,6 @@ class HeadingNoise:
 PERSON_NOISE = HeadingNoise()
 MECHANISM_NOISE = HeadingNoise(
     rate_std=float(np.deg2rad(0.2)),
-    joint_std=float(np.deg2rad(0.5)),
     girdle_std=float(np.deg2rad(0.5)),
     twist_std=float(np.deg2rad(0.5)),
     hinge_std=float(np.deg2rad(0.5)),
@@ -97,7 +98,7 @@ class Knot(NamedTuple):
     sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `compute_sides`, band-passed
     filters: FilterHeadings  # at the end
     lost: np.ndarray  # (k,) bool: the sensor has lost a sample
-    inside: Mapping[str, np.ndarray]  # phase → (m,) bool: its points coincide
+    clasped: np.ndarray  # (m,) bool: the palms are joined
 
 
 class StateColumns(NamedTuple):
@@ -140,7 +141,7 @@ class HeadingProblem:
     # (h, 3) [rad] of each hinge's axis about the long axis of the segment above and across, as in `HeadingNoise`, and
     # of the angle between its plane and the segment below.
     hinge_std: np.ndarray
-    closures: Mapping[str, PointPair]  # phase → points that coincide in it
+    palms: PointPair | None  # which the phase `CLASP` joins
     noise: HeadingNoise
     sensor_rate_hz: float
     stride: int  # sensors' samples from one sample of a knot to the next
@@ -214,9 +215,25 @@ def make_heading_problem(
     noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
     raw = {name: quat for name, quat in quat_LS.items() if name in recording.imus}
     pairs = find_joint_pairs(model, raw) if rate_hz >= LEAST_RATE_HZ else ()
-    hinges, hinge_std = _find_hinges(recording, names, subject, model, noise)
-    closures = _find_closures(names, model)
-    if not (pairs or hinges or any(recording.phases.get(phase) for phase in closures)):
+    start = StartPose(model.neutral_rotations)
+    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
+    calibrated, hinges, hinge_std = {} if recording.remounted else subject.hinges, [], []
+    for plane in find_hinges(model, start, names):
+        hinge = model.table.hinges[plane.name]
+        if plane.name in calibrated:
+            axis, std = start.turn(plane.on, calibrated[plane.name].axis), calibrated[plane.name].std
+            hinges.append(plane._replace(axis=axis))
+            hinge_std.append((noise.axis_std, noise.tilt_std, max(std, noise.hinge_std)))
+        elif not model.table.is_mechanism:
+            hinges.append(plane)
+            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
+            hinge_std.append((axis_std, hinge.tilt_std, max(hinge.softness, noise.hinge_std)))
+    [closure] = load_protocol(CLASP).closures
+    palms, (left, right) = None, closure.points
+    if {left, right} <= set(model.table.points):
+        with contextlib.suppress(BadSession):  # the sensors do not tell where they are
+            palms = PointPair(model, start, names, (left, right))
+    if not (pairs or hinges or (palms and recording.phases.get(CLASP))):
         return None
     stride = max(1, round(rate_hz / SAMPLE_RATE_HZ))
     drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), MEASURED_RATE_STD)
@@ -232,9 +249,9 @@ def make_heading_problem(
         model,
         subject,
         pairs,
-        hinges,
-        hinge_std,
-        closures,
+        tuple(hinges),
+        np.array(hinge_std).reshape(-1, 3),
+        palms,
         noise,
         sensor_rate_hz=rate_hz,
         stride=stride,
@@ -258,41 +275,3 @@ def find_start_variances(recording: Recording, segment: str, subject: Subject, m
     if segment == table.reference:
         return float(REFERENCE_START_STD**2), mount_var
     return compute_start_heading_var(recording, segment, subject, StartPose(table=table)), mount_var
-
-
-def _find_hinges(
-    recording: Recording, names: Sequence[str], subject: Subject, model: BodyModel, noise: HeadingNoise
-) -> tuple[tuple[HingePlane, ...], np.ndarray]:
-    """Return the hinges between two segments with sensors, and the standard deviations (h, 3) [rad] of `hinge_std`.
-
-    Their axes are calibrated, or of a person as the body's table has them.
-    """
-    table, start = model.table, StartPose(model.neutral_rotations)
-    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
-    calibrated = {} if recording.remounted else subject.hinges
-    hinges, stds = [], []
-    for plane in find_hinges(model, start, names):
-        hinge = table.hinges[plane.name]
-        if plane.name in calibrated:
-            found = calibrated[plane.name]
-            hinges.append(plane._replace(axis=start.turn(plane.on, found.axis)))
-            stds.append((noise.axis_std, noise.tilt_std, max(found.std, noise.hinge_std)))
-        elif not table.is_mechanism:
-            hinges.append(plane)
-            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
-            stds.append((axis_std, hinge.tilt_std, max(hinge.softness, noise.hinge_std)))
-    return tuple(hinges), np.array(stds).reshape(-1, 3)
-
-
-def _find_closures(names: Sequence[str], model: BodyModel) -> dict[str, PointPair]:
-    """Return the points that coincide in a phase of some protocol, where the sensors tell where they are."""
-    start, closures = StartPose(model.neutral_rotations), {}
-    for name in PROTOCOLS:
-        for closure in load_protocol(name).closures:
-            if closure.kind == "coincide" and set(closure.points) <= set(model.table.points):
-                first, second = closure.points
-                try:
-                    closures[closure.phase] = PointPair(model, start, names, (first, second))
-                except BadSession:
-                    continue
-    return closures

@@ -149,8 +149,7 @@ class HeadingCorrector:
         self._size = problem.stride * problem.samples_per_knot
         self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if problem.causal else 0
         self._samples = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
-        self._inside = {phase: np.zeros(self._size, dtype=bool) for phase in problem.closures}
-        self._open = set[str]()  # phases that have begun
+        self._clasped = np.zeros(self._size, dtype=bool)
         self._count = self._knots = 0  # samples in the open knot, knots before it
         self._knot_end, self._records = begin, False  # of the last knot: its end [s], whether it is recorded
         self._solving: Iterator[None] | None = None  # the last knot, until it is done
@@ -178,18 +177,16 @@ class HeadingCorrector:
         """Number of samples that can be pushed at once: after them `fade` changes, or the knot is complete."""
         return (self._lead if self._count < self._lead else self._size) - self._count
 
-    def mark(self, phase: str, *, begins: bool) -> None:
-        """Mark that a phase begins with the next sample, or has ended before it; its closures hold in between."""
-        (self._open.add if begins else self._open.discard)(phase)
+    def push(self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray | bool) -> bool:
+        """Add up to `remaining` samples; return whether the knot is complete.
 
-    def push(self, quat_VS: np.ndarray, accel_S: np.ndarray) -> bool:
-        """Add up to `remaining` samples: (n, k, 4) xyzw, (n, k, 3) [m/s²], NaN where lost; return whether the knot is
-        complete.
+        Parameters
+        ----------
+        quat_VS, accel_S : (n, k, 4) xyzw, (n, k, 3) [m/s²], NaN where lost
+        clasped : (n,) bool: the palms are joined
         """
         rows = slice(self._count, self._count + len(quat_VS))
-        self._samples[0][rows], self._samples[1][rows] = quat_VS, accel_S
-        for phase, inside in self._inside.items():
-            inside[rows] = phase in self._open
+        self._samples[0][rows], self._samples[1][rows], self._clasped[rows] = quat_VS, accel_S, clasped
         self._count += len(quat_VS)
         if self._solving is not None:
             if self._count >= self._lead:
@@ -206,18 +203,14 @@ class HeadingCorrector:
         samples = self._knots * self._size + self._count - 1
         self._knot_end = self._begin_s + samples / self.problem.sensor_rate_hz if end is None else end
         quat_VS, accel_S = (values[: self._count].copy() for values in self._samples)
-        inside = {phase: rows[: self._count : self.problem.stride].copy() for phase, rows in self._inside.items()}
-        self._solving = self._solve(quat_VS, accel_S, inside, filters)
+        clasped = self._clasped[: self._count : self.problem.stride].copy()
+        self._solving = self._solve(quat_VS, accel_S, clasped, filters)
         self._count, self._knots, self._records = 0, self._knots + 1, record
         if not self._lead:
             self._apply()
 
     def _solve(
-        self,
-        quat_VS: np.ndarray,
-        accel_S: np.ndarray,
-        inside: Mapping[str, np.ndarray],
-        filters: FilterHeadings,
+        self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray, filters: FilterHeadings
     ) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
         problem, rows = self.problem, slice(None, None, self.problem.stride)
@@ -228,7 +221,7 @@ class HeadingCorrector:
             sides = self._accelerations.push(R_WS, accel_S)[rows]
         lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
         quat_WL = rotations.multiply(quat_WS[rows], problem.quat_SL)
-        knot = Knot(quat_WL, sides, filters, lost, inside)
+        knot = Knot(quat_WL, sides, filters, lost, clasped)
         yield
         yield from self._filter.step(knot)
         if self._file is not None:

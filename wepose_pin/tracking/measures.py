@@ -1,4 +1,9 @@
-"""Measures of a tracked recording: the sensors' signals, static phases, headings, hinges, tips of limbs."""
+"""Measures of a tracked recording: the sensors' signals, headings, hinges, tips of limbs, and the error budget.
+
+The error budget is the contribution of each source of error to the standard deviation of each point. The contributions
+add up in variance. They are independent of one another but for lengths and girdles, whose correlation goes to the
+lengths, and the headings of segments, whose correlations go to the parts of the sensors, in proportion to these.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +14,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import BodyModel, BodyTable, HingeJoint
-from ..body.covariance import compute_axis_std
+from ..body import BodyModel, BodyTable
+from ..body.covariance import compute_axis_std, compute_point_covariances
 from ..body.kinematics import Pose
+from ..body.soft_tissue import correct_table
 from ..body.subject import Subject
 from ..filters import Orientation
 from ..recording import OrientationSensor, Recording
@@ -20,9 +26,11 @@ from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.sensors import compute_rate
 from .result import TrackResult
-from .segment_orientations import compute_heading_variance
+from .segment_orientations import compute_heading_variance, compute_soft_tissue_covariances
 
 PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
+PERIOD_S = 1.0  # [s] from one sample of the error budget to the next
+SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"
 
 
 class Signal(NamedTuple):
@@ -49,6 +57,7 @@ class HingeMotion(NamedTuple):
     bend: np.ndarray  # (n,) [rad] between the two, 0 in line
     flexion: np.ndarray  # (n,) [rad], the bend in the plane of the hinge; negative: against the way it bends
     aside: np.ndarray  # (n,) [rad], the moving segment out of that plane
+    extended: float  # [rad] least flexion of the hinge's range
 
 
 class TipMotion(NamedTuple):
@@ -70,7 +79,7 @@ class Measures:
     headings: Mapping[str, HeadingStd]  # of each segment whose filter has a covariance
     hinges: Mapping[str, HingeMotion]
     tips: Mapping[str, TipMotion]  # of each point whose path is drawn
-    error_budget: Mapping[str, Mapping[str, float]]  # as `ErrorBudget.summarize`
+    error_budget: Mapping[str, Mapping[str, float]]  # as `compute_error_budget`
 
 
 def measure_signal(
@@ -142,19 +151,15 @@ def measure_hinge(pose: Pose, table: BodyTable, name: str, subject: Subject | No
     R_on, R_moves = (_rotations(pose.quat_WL[segment], known) for segment in names)
     along_on, along_moves = (np.array(table.segments[segment].along) for segment in names)
     axis = np.array(hinge.axis) if subject is None or name not in subject.hinges else subject.hinges[name].axis
-    flexed = find_flexion_sign(hinge) * np.cross(axis, along_on)  # where the moving segment points at 90° of flexion
+    sign = -1.0 if sum(hinge.range) < 0.0 else 1.0  # it bends to the wider end of its range
+    flexed = sign * np.cross(axis, along_on)  # where the moving segment points at 90° of flexion
     moves = R_on.inv().apply(R_moves.apply(along_moves))
     bend = np.arctan2(np.linalg.norm(np.cross(along_on, moves), axis=1), moves @ along_on)
     flexion = np.arctan2(moves @ (flexed / np.linalg.norm(flexed)), moves @ along_on)
     aside = np.arcsin(np.clip(moves @ axis, -1.0, 1.0))
     for values in (bend, flexion, aside):
         values[~known] = np.nan
-    return HingeMotion(bend, flexion, aside)
-
-
-def find_flexion_sign(hinge: HingeJoint) -> float:
-    """1 where a hinge bends by rotating about its axis, −1 where it does so against it: the wider end of its range."""
-    return -1.0 if hinge.range[0] + hinge.range[1] < 0.0 else 1.0
+    return HingeMotion(bend, flexion, aside, min(sign * end for end in hinge.range))
 
 
 def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipMotion]:
@@ -189,6 +194,63 @@ def find_samples_after_start(tracked: TrackResult) -> np.ndarray:
     """
     since = tracked.time >= tracked.segments.start[1] - 1e-9
     return since if since.any() else ~since
+
+
+def compute_error_budget(tracked: TrackResult) -> dict[str, dict[str, float]]:
+    """Point → source of error → its share of the standard deviation [m] per axis, rms over time; the largest first.
+
+    Soft tissue and sensor are of each segment, as "torso: soft tissue". Parts below a tenth of a millimetre are left
+    out. It is empty of a mechanism, and where no covariance is known.
+    """
+    pose, body = tracked.pose, tracked.model
+    rows = np.arange(0, len(tracked.time), max(1, round(PERIOD_S * tracked.rate_hz)) if len(tracked.time) > 1 else 1)
+    for known in (*pose.quat_WL.values(), *pose.segment_cov.values()):
+        rows = rows[np.isfinite(known[rows].sum(axis=tuple(range(1, known.ndim))))]
+    if body.table.is_mechanism or not pose.point_cov or not len(rows):
+        return {}
+    quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}
+    total = {name: cov[rows] for name, cov in pose.segment_cov.items()}
+    zero = {name: np.zeros_like(cov) for name, cov in total.items()}
+    shape_cov = tracked.subject.shape_covariance(body.table)
+    of_girdles, none, k = shape_cov.copy(), 0.0 * shape_cov, len(body.lengths)
+    of_girdles[:k], of_girdles[:, :k] = 0.0, 0.0
+
+    def compute_variances(segment_cov: Mapping[str, np.ndarray], shape: np.ndarray) -> dict[str, float]:
+        covs = compute_point_covariances(body, quat_WL, segment_cov, shape)
+        return {point: _mean_variance(cov) for point, cov in covs.items()}
+
+    exact = compute_variances(zero, none)  # what leaves the law of the girdles
+    with_girdles, with_lengths = compute_variances(zero, of_girdles), compute_variances(zero, shape_cov)
+    independent = compute_variances(total, shape_cov)
+    soft = compute_soft_tissue_covariances(correct_table(body.table, body.tissue_means), quat_WL)
+    parts = {point: {GIRDLES: value, LENGTHS: with_lengths[point] - value} for point, value in with_girdles.items()}
+    for name in total:
+        own_soft = compute_variances({**zero, name: soft[name]}, none)
+        both = compute_variances({**zero, name: total[name]}, none)
+        for point, own in parts.items():
+            own[f"{name}: {SOFT_TISSUE}"] = own_soft[point] - exact[point]
+            own[f"{name}: {SENSOR}"] = both[point] - own_soft[point]
+    budget = {}
+    for point, own in parts.items():
+        sensors = sum(value for part, value in own.items() if part.endswith(SENSOR))
+        correlated = _mean_variance(pose.point_cov[point][rows]) - independent[point]
+        ratio = 1.0 + correlated / sensors if sensors else 1.0
+        stds = {part: np.sqrt(max(v * (ratio if part.endswith(SENSOR) else 1.0), 0.0)) for part, v in own.items()}
+        ordered = sorted(stds.items(), key=lambda item: -item[1])
+        budget[point] = {part: float(std) for part, std in ordered if std >= 1e-4}
+    return budget
+
+
+def _mean_variance(cov: np.ndarray) -> float:
+    return float(np.mean(np.trace(cov, axis1=1, axis2=2))) / 3.0
+
+
+def group_by_source(parts: Mapping[str, float]) -> dict[str, float]:
+    """Source → its share of a point's standard deviation, of all segments together, and of all sources as "all"."""
+    groups = dict.fromkeys((SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES), 0.0)
+    for part, std in parts.items():
+        groups[part.rpartition(": ")[2]] += std**2
+    return {source: float(np.sqrt(value)) for source, value in {**groups, "all": sum(groups.values())}.items()}
 
 
 def finite_max(values: np.ndarray) -> float:

@@ -26,7 +26,7 @@ from ..filters.sensors import SensorFilters, find_start_orientations
 from ..recording import ImuSensor, OrientationSensor, Recording, Sensor
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
-from .heading_problem import FilterHeadings, make_heading_problem
+from .heading_problem import CLASP, FilterHeadings, make_heading_problem
 from .headings import E_Z, HeadingCorrection, HeadingCorrector
 from .segment_orientations import (
     SegmentOrientations,
@@ -57,14 +57,13 @@ class FilterOutput(NamedTuple):
 class SegmentEstimator:
     """Orientation of each segment of a recording, chunk by chunk (`push`) or sample by sample (`step`): the same bits.
 
-    The first chunk contains the phases `start` and `static`. A sensor with measured orientations has no filter. The
-    smoother takes the whole recording as one chunk.
+    The first chunk contains the phases `start` and `static`. A sensor with measured orientations has no filter; where
+    it is lost its last one stands causally, else the reader has interpolated. The smoother takes the whole recording.
 
     Parameters
     ----------
     subject : its calibrated mounts are used in place of those that the session states; None: the stated ones
-    options : None: the default ones. While measured orientations are lost, the last one stands where `causal`; else
-        they are interpolated, as the reader does
+    options : None: the default ones
     start_pose : of the body; left out: the N-pose
     heading_body : the person and the body by which headings are observed from the end of the start pose on; None:
         they are not
@@ -118,10 +117,9 @@ class SegmentEstimator:
         self.diagnostics = tuple(drop_consequences((*phases.diagnostics, *diagnostics)))
         self.names, self.rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         k = len(self.names)
-        self._measured = np.array([isinstance(each, OrientationSensor) for each in first.sensors.values()], dtype=bool)
+        self._measured = np.array([name not in first.imus for name in self.names])
         self._lost = np.zeros(k, dtype=int)  # samples since a measured orientation
-        quat_LS = {name: mounts[name].as_quat() for name in self.names}
-        self._quat_LS = np.array(list(quat_LS.values()))
+        self._quat_LS = np.array([mounts[name].as_quat() for name in self.names])
         # (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
         self._heading_offset = np.array([offsets[name] for name in self.names])
         self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
@@ -135,6 +133,7 @@ class SegmentEstimator:
         self._variance = np.full((3, k), np.nan)
         problem = None
         if self._heading_body is not None and not any(sensor.aligned for sensor in first.sensors.values()):
+            quat_LS = dict(zip(self.names, self._quat_LS, strict=True))
             problem = make_heading_problem(
                 first, quat_LS, phases.noises, *self._heading_body, causal=self._options.causal
             )
@@ -152,16 +151,19 @@ class SegmentEstimator:
     @property
     def static(self) -> np.ndarray:
         """(k,) bool: static by the filter's test at the last step; false of measured orientations."""
-        static = np.zeros(len(self.names), dtype=np.bool_)
-        static[~self._measured] = self._filters.static
-        return static
+        return self._of_all(self._filters.static, np.False_)
 
     @property
     def gyro_bias(self) -> np.ndarray:
         """(k, 3) [rad/s] after the last sample; NaN of measured orientations."""
-        bias = np.full((len(self.names), 3), np.nan)
-        bias[~self._measured] = self._filters.gyro_bias
-        return bias
+        return self._of_all(self._filters.gyro_bias, np.nan, 3)
+
+    def _of_all(self, values: np.ndarray | None, missing: float | np.bool_, *shape: int) -> np.ndarray:
+        """Return values (k, *shape) of all sensors from those of the filters; `missing` where there is none."""
+        all_values = np.full((len(self.names), *shape), missing)
+        if values is not None:
+            all_values[~self._measured] = values
+        return all_values
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Add one sample, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost; return `quat_WL` (k, 4).
@@ -183,7 +185,7 @@ class SegmentEstimator:
         self._oldest = (self._oldest + 1) % len(self._recent)
         if self.headings is not None:
             self._variance = self.headings.variance  # of this sample, as in `_place`
-            if self.headings.push(row[None], accel_S[None]):
+            if self.headings.push(row[None], accel_S[None], self._clasped):
                 self.headings.close(self._read_filters().at(0))
         return self.quat_WL
 
@@ -193,13 +195,9 @@ class SegmentEstimator:
 
     def _read_filters(self) -> FilterOutput:
         """Read what the filters state after the last step."""
-        k, filters = len(self.names), self._filters
-        quat_VS = self._recent[self._oldest - 1][None].copy()
-        output = FilterOutput(quat_VS, np.full((1, k, 3, 3), np.nan), np.full((1, k, 3), np.nan))
-        if filters.attitude_cov is not None:
-            output.attitude_cov[0, ~self._measured] = filters.attitude_cov
-            output.about_vertical[0, ~self._measured] = filters.about_vertical
-        return output
+        filters, quat_VS = self._filters, self._recent[self._oldest - 1].copy()
+        attitude_cov = self._of_all(filters.attitude_cov, np.nan, 3, 3)
+        return FilterOutput(quat_VS[None], attitude_cov[None], self._of_all(filters.about_vertical, np.nan, 3)[None])
 
     def _stack(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> FilterOutput:
         """Stack what the filters state of a chunk."""
@@ -229,13 +227,13 @@ class SegmentEstimator:
         history = np.concatenate([self._order_recent(), output.quat_VS])
         before = len(history) - n
         accel_S = np.stack([_find_specific_force(sensor) for sensor in chunk.sensors.values()], axis=1)
-        marks = self._find_marks(chunk)
+        clasped = np.zeros(n, dtype=bool)
+        for interval in chunk.phases.get(CLASP, ()):
+            clasped[chunk.span(interval)] = True
         resets = {tick for tick in chunk.resets if 0 <= tick < n and before}  # none before the start pose has ended
-        for first, last in pairwise(sorted({0, *resets, *marks, min(begin, n), n})):
+        for first, last in pairwise(sorted({0, *resets, min(begin, n), n})):
             if first in resets:
                 self._reset(history[max(0, before + first - size) : before + first])
-            for phase, begins in marks.get(first, ()):
-                self.mark_phase(phase, begins=begins)
             while first < last:
                 stop = last
                 if self.headings is not None and first >= begin:
@@ -245,13 +243,13 @@ class SegmentEstimator:
                 _place_segments(*placed)
                 variance[rows], offset[rows] = self._variance, self._heading_offset
                 if self.headings is not None and first >= begin:
-                    if self.headings.push(output.quat_VS[rows], accel_S[rows]):
+                    if self.headings.push(output.quat_VS[rows], accel_S[rows], clasped[rows]):
                         self.headings.close(output.at(stop - 1), end=float(chunk.time[stop - 1]), record=True)
                     if self._options.causal:
                         self._variance = self.headings.variance
                 first = stop
         self._recent, self._oldest, self._filter_headings = history[-size:], 0, output.at(-1)
-        self._end_s = float(chunk.time[-1])
+        self._end_s, self._clasped = float(chunk.time[-1]), bool(clasped[-1])
         return SegmentOrientations(
             recording=chunk,
             options=self._options,
@@ -269,21 +267,10 @@ class SegmentEstimator:
         """Return the correction of the headings after the last chunk; None: nothing observes them."""
         return None if self.headings is None else self.headings.smooth(self._filter_headings, self._end_s)
 
-    def _find_marks(self, chunk: Recording) -> dict[int, list[tuple[str, bool]]]:
-        """Find sample → phases that begin (True) or have ended with it, of those that headings are corrected by."""
-        marks: dict[int, list[tuple[str, bool]]] = {}
-        for phase in () if self.headings is None else self.headings.problem.closures:
-            inside = np.zeros(len(chunk), dtype=bool)
-            for interval in chunk.phases.get(phase, ()):
-                inside[chunk.span(interval)] = True
-            for sample in (0, *(np.flatnonzero(np.diff(inside)) + 1).tolist()):
-                marks.setdefault(sample, []).append((phase, bool(inside[sample])))
-        return marks
-
     def mark_phase(self, phase: str, *, begins: bool) -> None:
-        """Mark that a phase, such as `clasp`, begins with the next sample, or has ended before it."""
-        if self.headings is not None:
-            self.headings.mark(phase, begins=begins)
+        """Mark that a phase begins with the next sample, or has ended before it; of `CLASP` it tells headings."""
+        if phase == CLASP:
+            self._clasped = begins
 
     def reset_headings(self) -> None:
         """Reset the headings: the body has stood in the start pose again for `RESET_S`."""

@@ -7,12 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from .. import rotations
-from ..errors import BadPhase
 from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
 from ..recording import Intervals, OrientationSensor, Recording, join_recordings
 from ..recording.arrivals import list_numbers, unpack_orientations
-from ..recording.clocks import Clock
-from ..recording.gaps import GOOD, LONG, bridge
 
 START_POSE_HOLD_S = 3.0  # [s] of standing still for a start pose that is not stated
 CHECK_PERIOD_S = 0.1  # [s] between two checks for motion
@@ -147,31 +144,11 @@ def stack_ticks(chunk: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recording:
-    """Return the part of a recording with the start pose, and with a phase `static` that ends before it does.
-
-    Gaps are bridged from samples before the end of the start pose alone; a reader uses later samples as well.
-
-    Raises
-    ------
-    BadPhase
-        A sensor without samples in the start pose.
-    """
+    """Return the part of a recording with the start pose, and with a phase `static` that ends before it does."""
     before: dict[str, Intervals] = {"start": (interval,)}
     span, static = recording.span(interval), recording.phases.get("static", ())
     begin = span.start
     if static and static[0][1] <= interval[1]:
         before["static"] = static[:1]
         begin = min(begin, recording.span(static[0]).start)
-    part = recording.cut(slice(begin, span.stop))
-    clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
-    sensors = dict(part.sensors)
-    for name, sensor in part.imus.items():
-        if sensor.gap is None or not sensor.gap.any():
-            continue
-        if sensor.gap.all():
-            where = f"{part.where()}: phases.start: sensors.{name}"
-            raise BadPhase(f"{where} sent nothing in it; state seconds in which all do")
-        marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
-        gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
-        sensors[name] = replace(sensor, gyro_S=gyro_S, accel_S=accel_S)
-    return replace(part, phases=before, sensors=sensors)
+    return replace(recording.cut(slice(begin, span.stop)), phases=before)

@@ -13,15 +13,13 @@ from ..diagnostics import INFO, WARNING, Diagnostic, as_json, drop_consequences,
 from ..filters import STATIC_ONLY, Orientation, join_orientations
 from ..recording import Recording
 from ..recording.gaps import find_runs
-from .error_budget import ErrorBudget
 from .heading_problem import find_start_variances
 from .measures import (
     PEAK_OVER_S,
-    HingeMotion,
     Measures,
     Signal,
+    compute_error_budget,
     compute_joint_heading_stds,
-    find_flexion_sign,
     find_samples_after_start,
     finite_max,
     longest_run_s,
@@ -44,7 +42,7 @@ HEADING = np.deg2rad(10.0)  # one standard deviation of the drift between the se
 TURNED, TURNED_STDS = np.deg2rad(10.0), 2.5
 # Beyond the range of a hinge while it extends: in the start pose a hanging elbow is bent by 5 to 15 deg.
 RANGE_MARGIN = np.deg2rad(5.0)
-BENT, ASIDE = np.deg2rad(20.0), np.deg2rad(30.0)  # a hinge that is bent so far shows the plane in which it bends
+BENT, ASIDE = np.deg2rad(20.0), float(np.deg2rad(30.0))  # a hinge that is bent so far shows the plane in which it bends
 LASTING_S = 1.0
 
 
@@ -95,8 +93,6 @@ class SummaryAccumulator:
         self._static: dict[str, list[np.ndarray]] = {}
         self._peak_speed: dict[str, float] = {}  # [m/s] of each tip
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
-        self._ranges: dict[str, tuple[float, float]] = {}  # joint of a mechanism → least and largest value [rad or m]
-        self._error_budget = ErrorBudget()
 
     def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
         """Iterate over chunks, and add each."""
@@ -106,26 +102,19 @@ class SummaryAccumulator:
 
     def add(self, tracked: TrackResult) -> None:
         """Add the next chunk."""
-        n = len(tracked.time)
-        rows = np.arange(-self._samples % self._every, n, self._every) if self._every > 1 else slice(None)
+        rows = slice(-self._samples % self._every, None, self._every)
         self._poses.append(tracked.pose.cut(rows))
         for segment, orientation in tracked.segments.orientation.items():
             self._static.setdefault(segment, []).append(orientation.static)
             self._orientations.setdefault(segment, []).append(orientation.take(rows))
-        rate_hz, poses = tracked.recording.rate_hz, [tracked.pose]
+        rate_hz, pose = tracked.recording.rate_hz, tracked.pose
         if self._samples:  # from the chunk before into this one
-            size = max(1, round(PEAK_OVER_S * rate_hz))
-            poses.append(join_poses([self.last.pose.cut(slice(-size, None)), tracked.pose.cut(slice(size))]))
-        for pose in poses:
-            for name, tip in measure_tips(pose, rate_hz, tracked.model.table).items():
-                self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), tip.peak_speed)
+            pose = join_poses([self.last.pose.cut(slice(-max(1, round(PEAK_OVER_S * rate_hz)), None)), pose])
+        for name, tip in measure_tips(pose, rate_hz, tracked.model.table).items():
+            self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), tip.peak_speed)
         for segment, angle in tracked.compute_orientation_residuals().items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
-        for joint, values in tracked.joints.items():
-            low, high = self._ranges.get(joint, (np.inf, -np.inf))
-            self._ranges[joint] = min(low, float(values.min())), max(high, float(values.max()))
-        self._error_budget.add(tracked)
-        self._samples += n
+        self._samples += len(tracked.time)
         self.last = tracked
 
     def finish(self) -> TrackSummary:
@@ -143,9 +132,10 @@ class SummaryAccumulator:
         tracked = replace(last, pose=join_poses(self._poses), source=source)
         measures = self._measure(tracked, recording)
         residual_rms = {name: float(np.sqrt(squares / self._samples)) for name, squares in self._residual.items()}
-        diagnostics = merge(_diagnose_model(last, residual_rms), diagnose_motion(tracked, measures))
+        diagnostics = (*last.segments.diagnostics, *last.model.diagnostics, *_diagnose_model(last, residual_rms))
+        diagnostics = merge(diagnostics, _diagnose_motion(tracked, measures))
         ordered = tuple(gravest_first(drop_consequences(diagnostics)))
-        return TrackSummary(self._compose(recording, measures, residual_rms, ordered), ordered, tracked, measures)
+        return TrackSummary(self._compose(tracked, measures, residual_rms, ordered), ordered, tracked, measures)
 
     def _measure(self, tracked: TrackResult, recording: Recording) -> Measures:
         """All measures: `tracked` has the samples that are shown, `recording` all of them."""
@@ -166,17 +156,17 @@ class SummaryAccumulator:
             measure_headings(tracked),
             {name: motion for name, motion in hinges.items() if motion is not None},
             {name: tip._replace(peak_speed=self._peak_speed[name]) for name, tip in tips.items()},
-            self._error_budget.summarize(),
+            compute_error_budget(tracked),
         )
 
     def _compose(
         self,
-        recording: Recording,
+        tracked: TrackResult,
         measures: Measures,
         residual_rms: dict[str, float],
         diagnostics: Iterable[Diagnostic],
     ) -> dict[str, Any]:
-        last = self.last
+        last, recording = self.last, self._recording.cut(slice(len(self._recording) - self._samples, None))
         table, correction, segments = last.model.table, last.correction, last.segments
         sensors: dict[str, Any] = {}
         for segment, sensor in recording.sensors.items():
@@ -212,7 +202,10 @@ class SummaryAccumulator:
         if table.is_mechanism:
             content |= {
                 "start_joints": dict(table.poses.get(recording.start_pose, recording.joints)),  # others are at zero
-                "joints": {name: {"min": round(a, 5), "max": round(b, 5)} for name, (a, b) in self._ranges.items()},
+                "joints": {
+                    name: {"min": round(float(values.min()), 5), "max": round(float(values.max()), 5)}
+                    for name, values in tracked.joints.items()
+                },
                 "undetermined_joints": last.find_undetermined_joints(),
             }
         return content | {
@@ -228,25 +221,22 @@ class SummaryAccumulator:
 # Diagnostics ----------------------------------------------------------------------------------------------------------
 
 
-def _diagnose_model(tracked: TrackResult, residual_rms: dict[str, float]) -> tuple[Diagnostic, ...]:
-    """The diagnostics of reading, alignment and model."""
-    table, diagnostics = tracked.model.table, list(tracked.segments.diagnostics)
+def _diagnose_model(tracked: TrackResult, residual_rms: dict[str, float]) -> Iterator[Diagnostic]:
+    table = tracked.model.table
     missing = [point for point in table.points if point not in tracked.points]
     lacking = [name for name in table.needed if name not in tracked.quat_WL]
     if missing and lacking:
-        facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
-        diagnostics.append(Diagnostic("sensors-missing", INFO, facts=facts))
+        yield Diagnostic("sensors-missing", INFO, facts={"segments": ", ".join(lacking), "points": ", ".join(missing)})
     if joints := tracked.find_undetermined_joints():
         facts = {"variant": "joints", "joints": ", ".join(joints)}
-        diagnostics.append(Diagnostic("sensors-missing", WARNING, facts=facts))
+        yield Diagnostic("sensors-missing", WARNING, facts=facts)
     for segment, rms in residual_rms.items():
         if rms > MOST_RESIDUAL:
-            diagnostics.append(Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL))
-    return *diagnostics, *tracked.model.diagnostics
+            yield Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
 
 
-def diagnose_motion(tracked: TrackResult, measures: Measures) -> Iterator[Diagnostic]:
-    """The diagnostics of signals, headings, start pose and hinges; `measures` are the recording's."""
+def _diagnose_motion(tracked: TrackResult, measures: Measures) -> Iterator[Diagnostic]:
+    """The diagnostics of signals, headings, start pose and hinges."""
     for name, signal in measures.signals.items():
         yield from _diagnose_signal(tracked, name, signal)
     since, start = find_samples_after_start(tracked), tracked.segments.start
@@ -254,16 +244,24 @@ def diagnose_motion(tracked: TrackResult, measures: Measures) -> Iterator[Diagno
     wide = {joint: most for joint, std in stds.items() if (most := finite_max(std[since])) > HEADING}
     for joint in sorted(wide, key=wide.__getitem__, reverse=True):
         yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING)
-    if tracked.correction is not None:
-        for name, turned_deg in tracked.correction.max_correction_deg.items():
-            start_var = sum(find_start_variances(tracked.recording, name, tracked.subject, tracked.model))
-            limit = max(TURNED, TURNED_STDS * float(np.sqrt(start_var)))
-            if (turned := float(np.deg2rad(turned_deg))) > limit:
-                yield Diagnostic("heading-corrected-far", WARNING, name, turned, limit)
+    corrections = {} if tracked.correction is None else tracked.correction.max_correction_deg
+    for name, turned_deg in corrections.items():
+        start_var = sum(find_start_variances(tracked.recording, name, tracked.subject, tracked.model))
+        limit = max(TURNED, TURNED_STDS * float(np.sqrt(start_var)))
+        if (turned := float(np.deg2rad(turned_deg))) > limit:
+            yield Diagnostic("heading-corrected-far", WARNING, name, turned, limit)
     if (late := float(start[0] - tracked.time[0])) > LATE_START_S:
         yield Diagnostic("start-pose-late", INFO, "", late, LATE_START_S)
     for name, motion in measures.hinges.items():
-        yield from _diagnose_hinge(tracked, name, motion)
+        extended, in_plane = motion.extended - RANGE_MARGIN, np.abs(motion.aside) < np.deg2rad(45.0)
+        back = in_plane & (motion.flexion < extended) & (motion.bend < np.deg2rad(90.0))
+        if (seconds := np.count_nonzero(back) / tracked.recording.rate_hz) > LASTING_S:
+            most, facts = float(-motion.flexion[back].min()), {"duration": seconds}
+            yield Diagnostic("hinge-implausible", WARNING, name, most, -extended, facts)
+        aside = (motion.bend > BENT) & (np.abs(motion.aside) > ASIDE)
+        if np.count_nonzero(aside) / tracked.recording.rate_hz > LASTING_S:
+            most = float(np.abs(motion.aside[aside]).max())
+            yield Diagnostic("hinge-implausible", WARNING, name, most, ASIDE, {"variant": "sideways"})
 
 
 def _diagnose_signal(tracked: TrackResult, name: str, signal: Signal) -> Iterator[Diagnostic]:
@@ -278,24 +276,3 @@ def _diagnose_signal(tracked: TrackResult, name: str, signal: Signal) -> Iterato
         if seconds > LONG_MOTION_S or share < LITTLE_STATIC:
             severity = WARNING if tracked.options.method in STATIC_ONLY else INFO
             yield Diagnostic("static-phases-rare", severity, name, share, LITTLE_STATIC, {"longest": seconds})
-
-
-def _diagnose_hinge(tracked: TrackResult, name: str, motion: HingeMotion) -> Iterator[Diagnostic]:
-    rate_hz, table = tracked.recording.rate_hz, tracked.model.table
-    hinge = table.hinges[name]
-    extended = float(min(find_flexion_sign(hinge) * end for end in hinge.range) - RANGE_MARGIN)
-    facts: dict[str, float | str] = {
-        "joint": table.shared_name(name),
-        "above": table.shared_name(hinge.on),
-        "below": table.shared_name(hinge.moves),
-    }
-    in_plane = np.abs(motion.aside) < np.deg2rad(45.0)
-    back = in_plane & (motion.flexion < extended) & (motion.bend < np.deg2rad(90.0))
-    if (seconds := np.count_nonzero(back) / rate_hz) > LASTING_S:
-        most = float(-motion.flexion[back].min())
-        yield Diagnostic("hinge-implausible", WARNING, name, most, -extended, {**facts, "duration": seconds})
-    aside = (motion.bend > BENT) & (np.abs(motion.aside) > ASIDE)
-    if np.count_nonzero(aside) / rate_hz > LASTING_S:
-        most = float(np.abs(motion.aside[aside]).max())
-        facts["variant"] = "sideways"
-        yield Diagnostic("hinge-implausible", WARNING, name, most, float(ASIDE), facts)

@@ -47,7 +47,6 @@ class Tracker:
     model : a body, its file, or the name of a body of the package, scaled to the subject's lengths; None: the one that
         the recording names, else the upper body. Without a subject a model that is given or named keeps its own lengths
     options : None: the default ones
-    with_point_cov : compute the covariances of the points; a page that shows none does without
 
     Attributes
     ----------
@@ -60,15 +59,10 @@ class Tracker:
         *,
         model: BodyModel | str | Path | None = None,
         options: TrackOptions | None = None,
-        with_point_cov: bool = True,
     ) -> None:
         self.options = options or TrackOptions()
-        self._with_point_cov = with_point_cov
         self._subject, self._model = subject, model
-        self._person: Subject  # as used; it and the next two from the first chunk on
-        self._body: BodyModel
-        self._start_pose: StartPose
-        self._is_begun = self._has_tracked = False
+        self._fitted: tuple[Subject, BodyModel, StartPose] | None = None  # as used, from the first chunk on
         self._start = StartPoseCutter()  # of a causal tracker
         self.segment_estimator: SegmentEstimator | None = None
         self._kinematics: KinematicsSolver | None = None
@@ -83,32 +77,29 @@ class Tracker:
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        options, is_first = self.options, self.segment_estimator is None
-        if not self._is_begun:
-            self._is_begun = True
-            self._person, self._body, self._start_pose = _fit_body(self._subject, self._model, chunk)
+        options, estimator = self.options, self.segment_estimator
+        self._fitted = self._fitted or _fit_body(self._subject, self._model, chunk)
         if chunk.resets and (options.open_loop or not options.causal):
             chunk = replace(chunk, resets=())
-        if options.causal and is_first:
-            found = self._start.push(chunk)
-            if found is None:
+        if estimator is not None and options.method in OFFLINE:
+            raise BadOption(f"method '{options.method}' takes the whole recording as one chunk")
+        if estimator is None and options.causal:
+            parts = self._start.push(chunk)
+            if parts is None:
                 return None
-            start, chunk = found
+            start, chunk = parts
             self.segment_estimator = self._make_estimator(observes_headings=not options.open_loop)
             self.segment_estimator.push(start)
-            if not len(chunk):
-                return None
-        elif is_first:
+        elif estimator is None:
             self.segment_estimator = self._make_estimator(observes_headings=not options.open_loop)
-        elif options.method in OFFLINE:
-            raise BadOption(f"method '{options.method}' takes the whole recording as one chunk")
         assert self.segment_estimator is not None
+        if not len(chunk):
+            return None
         segments, headings = self.segment_estimator.push(chunk), self.segment_estimator.headings
         if headings is None or options.causal:
-            self._has_tracked = True
             return self._solve_pose(segments, None if headings is None else headings.collect())
         self._chunks.append(chunk)
-        self._only = segments if is_first else None
+        self._only = segments if estimator is None else None
         return None
 
     def smooth(self) -> Iterator[TrackResult]:
@@ -119,7 +110,7 @@ class Tracker:
         BadPhase
             A causal tracker was given no start pose, or nothing after it.
         """
-        if self.options.causal and not self._has_tracked:
+        if self.options.causal and self._kinematics is None:
             raise BadPhase(self._start.explain_end())
         if not self._chunks or self.segment_estimator is None:
             return
@@ -129,28 +120,24 @@ class Tracker:
             yield self._solve_pose(segments if correction is None else correction.correct(segments), correction)
 
     def _make_estimator(self, *, observes_headings: bool) -> SegmentEstimator:
-        heading_body = (self._person, self._body) if observes_headings else None
-        return SegmentEstimator(self._subject, self.options, self._start_pose, heading_body)
+        assert self._fitted is not None
+        person, body, start_pose = self._fitted
+        return SegmentEstimator(self._subject, self.options, start_pose, (person, body) if observes_headings else None)
 
     def _solve_pose(self, segments: SegmentOrientations, correction: HeadingCorrection | None = None) -> TrackResult:
         """Return a chunk with its pose; its headings have been corrected."""
-        recording, person, body = segments.recording, self._person, self._body
+        assert self._fitted is not None
+        recording, (person, body, start_pose) = segments.recording, self._fitted
         if self._kinematics is None:
-            limits, start = self.options.limits, self._start_pose.q
-            self._kinematics = KinematicsSolver(body, segments.quat_WL, limits=limits, start=start)
+            limits = self.options.limits
+            self._kinematics = KinematicsSolver(body, segments.quat_WL, limits=limits, start=start_pose.q)
         tissue = SoftTissueCorrection(body.table, body.tissue_means, tuple(segments.quat_WL))
         pose = self._kinematics.solve_chunk(recording.time, tissue.correct_segments(segments.quat_WL))
-        point_cov: dict[str, np.ndarray] = {}
-        if self._with_point_cov:
-            segment_cov, shape_cov = segments.covariance_W, person.shape_covariance(body.table)
-            shared = {} if correction is None else correction.correlate_segments(recording.time, segment_cov)
-            point_cov = compute_point_covariances(body, pose.quat_WL, segment_cov, shape_cov, pose.q, shared)
-        pose = replace(
-            pose,
-            segment_cov=segments.covariance_W,
-            point_cov=point_cov,
-            gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
-        )
+        segment_cov, shape_cov = segments.covariance_W, person.shape_covariance(body.table)
+        shared = {} if correction is None else correction.correlate_segments(recording.time, segment_cov)
+        point_cov = compute_point_covariances(body, pose.quat_WL, segment_cov, shape_cov, pose.q, shared)
+        gap = {name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None}
+        pose = replace(pose, segment_cov=segment_cov, point_cov=point_cov, gap=gap)
         return TrackResult(recording.name, pose, body, person, recording.phases, recording.marks, segments, correction)
 
 
@@ -165,17 +152,12 @@ def track_chunks(
 ) -> Iterator[TrackResult]:
     """Iterate over a recording's chunks with their poses: results of a day that are too long for memory.
 
-    The smoother's is one chunk. Parameters as of `Tracker`.
+    The smoother's is one chunk. Parameters and errors as of `Tracker`.
 
     Parameters
     ----------
     chunk_s : [s] of the chunks; the first one is as much longer as the phases `start` and `static` need
     progress : is called with the share that is done, chunk by chunk
-
-    Raises
-    ------
-    WeposeError
-        As `Tracker`.
     """
     options = options or TrackOptions()
     tracker = Tracker(subject, model=model, options=options)
@@ -183,18 +165,15 @@ def track_chunks(
     spans = [recording.phases[phase][0] for phase in ("start", "static") if recording.phases.get(phase)]
     first_s = max(last for _, last in spans) - begin + SHORTEST_S if spans else BEGINNING_S
     chunk_s = min(end - begin + 1.0, np.inf if options.method in OFFLINE else max(chunk_s, SHORTEST_S))
-
-    def report(chunk: TrackResult | Recording, pass_number: int) -> None:
-        if progress is not None:
-            progress((pass_number + (float(chunk.time[-1]) - begin) / (end - begin)) / 2.0)
-
     for chunk in recording.chunks(chunk_s, first_s):
         tracked = tracker.push(chunk)
-        report(chunk, 0)
+        if progress is not None:
+            progress(0.5 * (float(chunk.time[-1]) - begin) / (end - begin))
         if tracked is not None:
             yield tracked
     for tracked in tracker.smooth():
-        report(tracked, 1)
+        if progress is not None:
+            progress(0.5 + 0.5 * (float(tracked.time[-1]) - begin) / (end - begin))
         yield tracked
 
 
@@ -205,11 +184,6 @@ def _fit_body(
 
     The body is `model`, else the one that the recording names, else the upper body. Without a subject the lengths are
     those of the population prior, or of a chosen model its own.
-
-    Raises
-    ------
-    WeposeError
-        A body that cannot be read; sensors, a start pose or lengths that are not its own.
     """
     where = recording.where()
     chosen = model or recording.model or None

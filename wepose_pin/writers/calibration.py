@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..calibration import Calibration
-from ..calibration.quality import find_open_intervals
 from ..diagnostics import as_json as diagnostic_as_json
 from .result import as_json, versions, write_subject
 
@@ -69,7 +68,7 @@ def _document(calibration: Calibration) -> dict[str, Any]:
             "before": [_number(v) for v in calibration.prior_gap[some]],
             "contact": calibration.contact[some].round(3),
         },
-        "open_intervals": find_open_intervals(calibration),
+        "open_intervals": calibration.open_intervals,
         "effective_sample_size": calibration.effective_sample_size,
         "moved": dict(calibration.exchanged),
     }
