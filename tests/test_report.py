@@ -117,7 +117,7 @@ def test_one_hand_at_a_point(made: Made, tmp_path: Path) -> None:
     own.write_text('[[closure]]\nphase = "clasp"\nkind = "fixed_point"\npoints = ["left_palm"]\n')
     problem = replace(made[0].problem, protocol=load_protocol(own))
     page = render_calibration_report(replace(made[0], problem=problem), made[1], tracked=made[2])
-    assert "Palm to its point over time" in headings(page)
+    assert "Gap of the palms over time" in headings(page)
     assert "Not in the chain, known by the prior's proportions" in text_of(page)
     assert "joined" not in without_frame(page)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +10,7 @@ from .options import MORE, Angle, Force, Hz, Interval, Out, Phase, PhaseName
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
-    from ..angles.movement import Movement, MovementOptions
+    from ..angles.movement import Movement
 
 PAGE = "angles.html"
 DECIMALS = 4  # of tables; degrees and seconds
@@ -66,25 +65,42 @@ def angles(
         for more than 1 % of the time, the one that is so least.
     """
     options = dict(locals())
+    from dataclasses import replace
+
     from polars import selectors
 
     from ..angles import diagnose_lock
     from ..angles import movement_tables as build
-    from ..angles.movement import MovementOptions
+    from ..angles.movement import MovementOptions, analyze_movement
     from ..documents import whole_folder
-    from ..recording import check_selection
     from ..report import angles as report
     from ..report.page import write_pages
+    from ..writers import read_result
     from ..writers.provenance import collect_provenance, write_provenance
+    from ..writers.result import read_phases
 
-    check_selection(interval, phase)
     finds = f"--main-angle {main_angle}" if main_angle is not None else "--cycles" if cycles else ""
     if finds and repetitions is not None:
         raise BadOption(f"{finds}: finds repetitions, and --repetitions {repetitions} marks them; leave one out")
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
+            # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
             chosen = MovementOptions(shoulder, low_pass_hz, repetitions, main_angle, None, cycles)
-            movements = _analyze((result, *further), chosen, interval, phase, progress)
+            movements: list[Movement] = []
+            for k, each in enumerate((result, *further), 1):
+                progress("reading", 0.7 * (k - 1) / (1 + len(further)))
+                pose, _, about = read_result(each, interval, phase)
+                name = str(about.get("recording") or each.name)
+                name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
+                try:
+                    movement = analyze_movement(name, pose, read_phases(about), chosen)
+                except WrongOption as error:
+                    raise BadOption(f"{each}: {error}" if further else str(error)) from None
+                movements.append(movement)
+                chosen = replace(chosen, sequence=movement.sequence or chosen.sequence)
+                if repetitions is None and len(movement.repetitions.spans):
+                    source, rising = movement.repetitions.source, movement.repetitions.rising
+                    chosen = replace(chosen, main_angle=source, rising=rising)
             progress("writing", 0.7)
             tables = {
                 "angles": build.build_angle_table(movements),
@@ -119,36 +135,3 @@ def angles(
     say(f"Orientations {filtered}{by}")
     say_pages(out, {"Page": PAGE})
     say(f"Tables and figures: {out}")
-
-
-def _analyze(
-    folders: Sequence[Path],
-    options: MovementOptions,
-    interval: tuple[float, float] | None,
-    phase: str | None,
-    progress: Callable[[str, float], None],
-) -> list[Movement]:
-    """The movements of all results; by the angle, and in the direction, of the first one that has repetitions."""
-    from dataclasses import replace
-
-    from ..angles.movement import analyze_movement
-    from ..writers import read_result
-    from ..writers.result import read_phases
-
-    movements: list[Movement] = []
-    for k, folder in enumerate(folders):
-        progress("reading", 0.7 * k / len(folders))
-        pose, _, summary = read_result(folder, interval, phase)
-        name = str(summary.get("recording") or folder.name)
-        if name in [each.name for each in movements]:
-            name = f"{name} ({k + 1})"
-        try:
-            movement = analyze_movement(name, pose, read_phases(summary), options)
-        except WrongOption as error:
-            raise BadOption(f"{folder}: {error}" if len(folders) > 1 else str(error)) from None
-        found = movement.repetitions
-        options = replace(options, sequence=movement.sequence or options.sequence)
-        if options.phase is None and len(found.spans):
-            options = replace(options, main_angle=found.source, rising=found.rising)
-        movements.append(movement)
-    return movements

@@ -52,8 +52,8 @@ def parse(words: Sequence[str]) -> tuple[Callable[..., Any], inspect.BoundArgume
 
 def _describe(error: CycloptsError, command: str) -> str:
     if isinstance(error, UnknownOptionError):
-        switch, known = error.token.keyword or error.token.value, error.argument_collection
-        names = [name for argument in known for name in argument.names if name.startswith("--")]
+        switch = error.token.keyword or error.token.value
+        names = [argument.name for argument in error.argument_collection if argument.name.startswith("--")]
         return f"{switch} is not an option of wepose {command}; {one_of(names, switch)}"
     if isinstance(error, UnusedCliTokensError):
         return f"'{(error.unused_tokens or [''])[0]}' is one word too many for wepose {command}"
@@ -106,11 +106,6 @@ def _plain(text: RenderableType | None, paragraphs: bool = False) -> str:
     return capture.get().strip() if paragraphs else " ".join(capture.get().split())
 
 
-def _refuse_nan(_kind: type, value: Any) -> None:
-    if isinstance(value, float) and value != value:
-        raise ValueError("a number is needed")
-
-
 APP = App(
     name="wepose",
     help="Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows the "
@@ -125,7 +120,7 @@ APP = App(
     help_formatter=PlainHelp(),
     group_arguments=Group("Arguments", sort_key=0),
     group_parameters=Group("Options", sort_key=1),
-    default_parameter=Parameter(negative_iterable=(), negative_none=(), validator=_refuse_nan),
+    default_parameter=Parameter(negative_iterable=(), negative_none=()),
 )
 for _number, (_name, _place) in enumerate(COMMANDS.items()):
     APP.command(_place, name=_name, help_epilogue="", sort_key=_number)

@@ -9,12 +9,7 @@ from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 from .simulate import PROTOCOL, check_seed
 
 
-def demo(
-    *,
-    out: Out = Path("wepose-demo"),
-    seed: Number = 1,
-    force: Force = False,
-) -> None:
+def demo(*, out: Out = Path("wepose-demo"), seed: Number = 1, force: Force = False) -> None:
     """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
     A person of random size wears five Xsens MTi-3, stands in the N-pose (upright, arms hanging, palms to the thighs),

@@ -58,67 +58,49 @@ def evaluate(
     markers
         Use this table of markers before the one of the package (docs/formats.md).
     """
-    from ..recording import check_selection
-
-    check_selection(interval, phase)
-    if not align and fit is not None:
-        raise WrongOption("fit", fit, "nothing is fitted with --no-align; leave out one of the two")
-    with progress_bar() as progress:
-        progress("comparing", 0.0)
-        errors = _compare(result, truth, interval, phase, align, fit, time_offset, markers)
-    _print_errors(errors)
-    return errors
-
-
-def _compare(
-    result: Path,
-    truth: Path,
-    interval: tuple[float, float] | None,
-    phase: str | None,
-    align: bool,
-    fit: str | None,
-    time_offset: float | None,
-    markers: Path | None,
-) -> Evaluation:
-    """The errors of a result; the reference is brought to its clock and world where that is needed."""
     from ..body.kinematics import Pose, parse_pose_table
     from ..data_tables import read_table
-    from ..evaluation import evaluate, register
+    from ..evaluation import evaluate as compare
+    from ..evaluation import register
     from ..readers import load_session
     from ..readers.reference import is_reference, read_reference
     from ..recording import select_interval
     from ..writers import read_result
     from ..writers.result import read_phases
 
-    pose, model, summary = read_result(result)
-    selected = select_interval(pose.time, read_phases(summary), interval, phase)
-    file: Path | None = truth
-    if truth.suffix == ".toml" or truth.is_dir():
-        file = load_session(truth, gaps=True).truth
-    if file is None:
-        raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
-    foreign = is_reference(file)
-    if markers is not None and not foreign:
-        raise WrongOption("markers", str(markers), f"a .c3d or .trc as TRUTH; {file.name} has no markers")
-    if foreign:
-        measured = read_reference(file, markers)
-        reference, up = Pose(measured.time, measured.quat_VT, measured.points), measured.up
-        fit = fit or ("segments" if measured.own_frames else "world")
-    else:
-        reference, up = parse_pose_table(read_table(file), str(file)), None
-    if not align or fit is None:
-        if time_offset:
-            reference = replace(reference, time=reference.time + time_offset)
-        return evaluate(pose, reference, selected, model.table)
-    reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=time_offset)
-    first, last = registration.scored
-    begin, end = selected or registration.scored
-    scored = max(first, begin), min(last, end)
-    if not scored[0] < scored[1]:
-        needed = f"seconds after {first:.1f}, as those before align the reference; or --no-align"
-        raise WrongOption("interval", f"{begin:g} {end:g}", needed)
-    errors = evaluate(pose, reference, scored, model.table)
-    return replace(errors, registration=replace(registration, scored=scored))
+    if not align and fit is not None:
+        raise WrongOption("fit", fit, "nothing is fitted with --no-align; leave out one of the two")
+    with progress_bar() as progress:
+        progress("comparing", 0.0)
+        pose, model, summary = read_result(result)
+        selected = select_interval(pose.time, read_phases(summary), interval, phase)
+        file = load_session(truth, gaps=True).truth if truth.suffix == ".toml" or truth.is_dir() else truth
+        if file is None:
+            raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
+        up = None
+        if is_reference(file):
+            measured = read_reference(file, markers)
+            reference, up = Pose(measured.time, measured.quat_VT, measured.points), measured.up
+            fit = fit or ("segments" if measured.own_frames else "world")
+        elif markers is not None:
+            raise WrongOption("markers", str(markers), f"a .c3d or .trc as TRUTH; {file.name} has no markers")
+        else:
+            reference = parse_pose_table(read_table(file), str(file))
+        if align and fit is not None:
+            reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=time_offset)
+            first, last = registration.scored
+            begin, end = selected or registration.scored
+            scored = max(first, begin), min(last, end)
+            if not scored[0] < scored[1]:
+                needed = f"seconds after {first:.1f}, as those before align the reference; or --no-align"
+                raise WrongOption("interval", f"{begin:g} {end:g}", needed)
+            errors = compare(pose, reference, scored, model.table)
+            errors = replace(errors, registration=replace(registration, scored=scored))
+        else:
+            reference = replace(reference, time=reference.time + (time_offset or 0.0))
+            errors = compare(pose, reference, selected, model.table)
+    _print_errors(errors)
+    return errors
 
 
 def _print_errors(errors: Evaluation) -> None:
@@ -138,9 +120,7 @@ def _print_errors(errors: Evaluation) -> None:
     ]
     joints = [
         (
-            joint,
-            angle,
-            *(f"{e.mean:+.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}"),
+            *(joint, angle, f"{e.mean:+.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}"),
             *(f"{e.lower:+.2f} to {e.upper:+.2f}", f"{e.icc:.3f}", f"{e.range:.0f}"),
         )
         for joint, angles in errors.joints.items()
@@ -156,22 +136,25 @@ def _print_errors(errors: Evaluation) -> None:
         (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
         for name, u in {**errors.attitude_uncertainty, **points}.items()
     ]
-    tables: dict[str, tuple[tuple[str, ...], Sequence[Sequence[str]]]] = {
-        "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]": (
+    tables: tuple[tuple[str, tuple[str, ...], Sequence[Sequence[str]]], ...] = (
+        (
+            "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
             ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
             attitude,
         ),
-        "Joint angle error [deg], near gimbal lock left out; limits of agreement (Bland-Altman, 95 %); ICC(A,1)": (
+        (
+            "Joint angle error [deg], near gimbal lock left out; limits of agreement (Bland-Altman, 95 %); ICC(A,1)",
             ("joint", "angle", "mean", "rms", "largest", "limits of agreement", "ICC", "range"),
             joints,
         ),
-        "Position error [mm], mean ± std": (("point", "from the root", "from where its limb begins"), positions),
-        "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within": (
+        ("Position error [mm], mean ± std", ("point", "from the root", "from where its limb begins"), positions),
+        (
+            "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
             ("of", "normalised", "within 1 std", "within 2 std"),
             uncertainty,
         ),
-    }
-    for title, (header, rows) in tables.items():
+    )
+    for title, header, rows in tables:
         if rows:
             print_table(title, header, rows)
 
@@ -180,14 +163,13 @@ def _say_registration(registration: Registration) -> None:
     """Say how the reference was brought to the result, and by which seconds."""
     from ..recording import format_span
 
-    fitted = registration.correlation == registration.correlation  # NaN where the offset was stated
-    clock = "stated" if not fitted else f"speeds correlate by {registration.correlation:.3f}"
+    stated = registration.correlation != registration.correlation  # NaN where the offset was stated
+    clock = "stated" if stated else f"speeds correlate by {registration.correlation:.3f}"
     say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
     say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
     say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
     if any(registration.shift_m):
-        x, y, z = registration.shift_m
-        say(f"  its points moved by {x:+.3f} {y:+.3f} {z:+.3f} m")
+        say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
     if registration.frames_deg:
         listed = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
         say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {listed}")

@@ -62,11 +62,9 @@ def export(
         the recording.
     """
     options = dict(locals())
-    from ..recording import check_selection
     from ..writers import export as room
     from ..writers.provenance import collect_provenance
 
-    check_selection(interval, phase)
     with progress_bar() as progress:
         progress("writing", 0.0)
         written = room.export(

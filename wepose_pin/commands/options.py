@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,11 +22,7 @@ Arms = Literal["left", "right", "both"]
 
 
 def _read_whole_number(_kind: type, tokens: Sequence[Token]) -> int:
-    """An int as it is written; cyclopts would round."""
-    try:
-        return int(tokens[0].value)
-    except ValueError:
-        raise ValueError(f"'{tokens[0].value}' is not a whole number") from None
+    return int(tokens[0].value)  # cyclopts would round
 
 
 # Validators: rooms load when an option is given ----------------------------------------------------------------------
@@ -85,8 +82,8 @@ LiveMethodOption = Annotated[LiveMethod, Parameter(help=_FILTERS.format(""))]
 # Values --------------------------------------------------------------------------------------------------------------
 
 
-def _read_entries(words: Sequence[Token], also_text: bool, needed: str) -> dict[str, Any]:
-    """What several ``NAME=VALUE`` say; of a value that may be a text, a number where it is one."""
+def _read_entries(_kind: type, words: Sequence[Token], needed: str = "NAME=METRES") -> dict[str, Any]:
+    """What several ``NAME=VALUE`` say; as NAME=METRES only numbers, else a number where it is one."""
     entries: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.value.partition("=")
@@ -98,17 +95,9 @@ def _read_entries(words: Sequence[Token], also_text: bool, needed: str) -> dict[
             entries[name] = float(value)
         except ValueError:
             entries[name] = value
-        if entries[name] != entries[name] or (isinstance(entries[name], str) and not also_text):
+        if entries[name] != entries[name] or (isinstance(entries[name], str) and needed == "NAME=METRES"):
             raise BadOption(f"{word.keyword}: {word.value}: '{value}' is not a number; {needed} is needed")
     return entries
-
-
-def _read_lengths(_kind: type, words: Sequence[Token]) -> dict[str, float]:
-    return _read_entries(words, False, "NAME=METRES")
-
-
-def _read_sizes(_kind: type, words: Sequence[Token]) -> dict[str, float | str]:
-    return _read_entries(words, True, "NAME=VALUE")
 
 
 Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
@@ -140,5 +129,7 @@ if TYPE_CHECKING:
     Measured = Mapping[str, float]
     Imperfection = Mapping[str, float | str]
 else:  # cyclopts collects the values of an option that is given several times only of a list
-    Measured = Annotated[list[str], Parameter(metavar="NAME=METRES", converter=_read_lengths)]
-    Imperfection = Annotated[list[str], Parameter(metavar="NAME=VALUE", converter=_read_sizes)]
+    Measured = Annotated[list[str], Parameter(metavar="NAME=METRES", converter=_read_entries)]
+    Imperfection = Annotated[
+        list[str], Parameter(metavar="NAME=VALUE", converter=partial(_read_entries, needed="NAME=VALUE"))
+    ]

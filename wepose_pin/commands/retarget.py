@@ -95,36 +95,26 @@ def retarget(
 
     from .. import retargeting
     from ..documents import whole_folder
-    from ..recording import check_selection
     from ..report import retargeting as report_room
     from ..report.page import write_pages
     from ..report.viewer import retarget_html
-    from ..retargeting.targets import check_scale_and_smoothing
     from ..retargeting.trajectory import STAGES
     from ..writers import read_result
     from ..writers.joint_motion import REPETITIONS
     from ..writers.provenance import collect_provenance
     from ..writers.result import as_json, read_phases
 
-    check_selection(interval, phase)
-    check_scale_and_smoothing(scale, smoothing_hz)
-    retargeting.LimitMargins(speed_scale, limit_margin)  # refuses what is out of range
+    names = ("robot", "arm", "task", "rate_hz", "scale", "smoothing_hz", "speed_scale", "limit_margin")
+    chosen: dict[str, Any] = {name: options[name] for name in names}
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
             progress("reading", 0.0)
             pose, body, about = read_result(result, interval, phase)
             trajectory = retargeting.retarget(
                 pose,
-                robot,
-                arm=arm,
-                task=task,
-                rate_hz=rate_hz,
-                scale=scale,
-                smoothing_hz=smoothing_hz,
-                speed_scale=speed_scale,
-                limit_margin=limit_margin,
                 table=body.table,
                 progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
+                **chosen,
             )
             progress("checking", 0.96)
             check = retargeting.check_limits(retargeting.build_table(trajectory), trajectory.robot.map)
@@ -154,8 +144,7 @@ def retarget(
         pages = ({"view.html": make_view} if view else {}) | ({"report.html": make_report} if report else {})
         failures = write_pages(out, pages, "summary.json")
     print_diagnostics([*map(from_json, summary["diagnostics"]), *failures])
-    print_table(*report_room.tabulate_run(summary))
-    for table in report_room.tabulate_hands(summary):
+    for table in (report_room.tabulate_run(summary), *report_room.tabulate_hands(summary)):
         print_table(*table)
     say_paragraph(report_room.describe_reliance(trajectory, summary))
     say_paragraph(report_room.describe_limits(summary))

@@ -48,33 +48,26 @@ def simulate(
     seed
         Sample the person and the motion by this seed.
     seconds
-        Simulate this many seconds of the activity (without it 40) or of the protocol's motion (without it 60); at least
-        5.
+        Simulate this many seconds of the activity (without it 40) or of the protocol's motion (without it 60).
     protocol
         Simulate the motion of this calibration protocol (see `wepose calibrate --help`): clasp, t_pose, bow, or
         several of them joined by +. Without it clasp+t_pose, or clasp alone for less than 30 s.
     activity
-        Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
-        too: walking on the spot (walk), sitting down and standing up (sit), running (run), or throwing overhand
-        (throw). Of the upper body: reaches, rests and typing of both arms, hands apart (tasks).
+        Simulate an activity in place of a protocol: walk (on the spot), sit (down and up), run or throw, of the whole
+        body, with sensors on pelvis, head, hands and legs too; tasks (reaches, rests and typing), of the upper body.
     preset
         Simulate only the sensors' noise and bias (ideal), or a person at the sizes of the literature (people): soft
-        tissue, shoulders that move with the arms, start poses as people hold them, wrists that bend, errors of sensors
-        and clocks; or a careful one at 0.3 of them (mild). Sizes and sources are in
-        wepose_pin/simulation/imperfections.py.
+        tissue, shoulders that move with the arms, start poses as people hold them, errors of sensors and clocks; or a
+        careful one at 0.3 of them (mild). docs/people.md has sizes and sources.
     rate_hz
         Sample the sensors at this rate, 20 to 2000 Hz.
     imperfection
         Simulate one imperfection at this size; may be given several times. mount=any: arbitrary sensor mounting, which
-        the session does not state. All others are numbers; 0 is off, inf for the two full scales. Of the body, as a
-        multiple of the size in the literature: tissue_gain (soft tissue that follows the joints), tissue_random (its
-        random part), girdle (shoulders), elbow (carrying angle), wrists, start_pose, sway (with breath); others:
-        palm_slip [m] in the clasp, start_heading_deg (torso against W), sensor_place (0 half-way along a segment, 1 as
-        people wear them). Of the sensors, standard deviation: gyro_scale, accel_scale (of the scale factors, 0.01 is
-        1 %), misalignment_deg, g_sensitivity_deg_s (per g), clock_jitter [s], clock_offset [s], clock_drift_ppm; full
-        scale: gyro_range_deg_s, accel_range_g; bits: of a sample over the full scale; dropped: fraction of samples
-        lost, at most 0.2; gyro_warm_up_deg_s (of the bias, in 15 min); accel_average (share of the sample interval over
-        which the accelerometer averages).
+        the session does not state. All others are numbers, 0 is off. Of the body, as a multiple of the size in the
+        literature: tissue_gain, tissue_random, girdle, elbow, wrists, start_pose, sway; palm_slip [m],
+        start_heading_deg, sensor_place. Of the sensors: gyro_scale, accel_scale (0.01 is 1 %), misalignment_deg,
+        g_sensitivity_deg_s, clock_jitter [s], clock_offset [s], clock_drift_ppm, gyro_range_deg_s, accel_range_g, bits,
+        dropped (share of the samples), gyro_warm_up_deg_s, accel_average.
     """
     options = dict(locals())
     from dataclasses import replace
@@ -98,31 +91,19 @@ def simulate(
     if seconds is not None and not 5.0 <= seconds <= LONGEST_S:
         raise BadOption(f"--seconds {seconds:g}: between 5 and {LONGEST_S:g}")
     sizes = choose_imperfections(preset, imperfection or {})
+    is_people = preset == "people"
     with progress_bar() as progress, whole_folder(out, force) as folder:
         progress("simulating a person", 0.0)
-        measured_std = room.PEOPLE_MEASURED_STD if preset == "people" else room.MEASURED_STD
         body = room.ACTIVITIES[activity].body if activity else DEFAULT_BODY
-        person = room.simulate_person(seed, measured_std, body)
+        person = room.simulate_person(seed, room.PEOPLE_MEASURED_STD if is_people else room.MEASURED_STD, body)
+        motion: dict[str, Any] = {"seed": seed, "rate_hz": rate_hz, "imperfections": sizes}
         if activity:
-            simulation = room.simulate_activity(
-                activity,
-                seed=seed,
-                rate_hz=rate_hz,
-                imperfections=sizes,
-                seconds=ACTIVITY_S if seconds is None else seconds,
-                lengths=person.lengths,
-            )
+            seconds = ACTIVITY_S if seconds is None else seconds
+            simulation = room.simulate_activity(activity, seconds=seconds, lengths=person.lengths, **motion)
         else:
-            clasp_s = PROTOCOL_S if seconds is None else seconds
-            simulation = room.simulate(
-                person.lengths,
-                seed=seed,
-                rate_hz=rate_hz,
-                imperfections=sizes,
-                clasp_s=clasp_s,
-                protocol=protocol or (PROTOCOL if clasp_s >= LEAST_S else SHORT_PROTOCOL),
-                circles=CIRCLES,
-            )
+            seconds = PROTOCOL_S if seconds is None else seconds
+            protocol = protocol or (PROTOCOL if seconds >= LEAST_S else SHORT_PROTOCOL)
+            simulation = room.simulate(person.lengths, clasp_s=seconds, protocol=protocol, circles=CIRCLES, **motion)
         write_session(folder, simulation.recording(f"simulated-{seed}"), simulation.truth())
         order = (*simulation.lengths, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(
@@ -137,7 +118,7 @@ def simulate(
         )
         (folder / "subject.toml").write_text(subject_toml(true), encoding="utf-8")
         write_provenance(folder, collect_provenance("simulate", options))
-    tape = _tape_breadths(person.measured) if preset == "people" else person.measured
+    tape = _tape_breadths(person.measured) if is_people else person.measured
     measured = " ".join(f"{name}={value:.4f}" for name, value in tape.items())
     about = f"measured: {measured}, stature {person.stature:.2f} m, sex {person.sex}"
     say(f"Session: {out / 'session.toml'}  ({about})")
@@ -151,13 +132,7 @@ def check_seed(seed: int) -> None:
 
 
 def choose_imperfections(preset: str, changes: Mapping[str, float | str]) -> Imperfections:
-    """The imperfections of a preset, with the sizes that were given.
-
-    Raises
-    ------
-    BadOption
-        An unknown imperfection, or a size that it cannot have.
-    """
+    """The imperfections of a preset, with the sizes that were given; `BadOption` where one is not possible."""
     from dataclasses import fields, replace
 
     from ..simulation import PRESETS

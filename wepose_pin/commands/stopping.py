@@ -8,18 +8,19 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _stopped: list[int] = []
 
 
 def catch_signals() -> None:
     """From here on both raise `KeyboardInterrupt`, and are remembered: a library may swallow that."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _SIGNALS:
         signal.signal(number, _stop)
 
 
 def ignore_signals() -> None:
     """While Python itself ends, a signal would take the exit code's place."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
@@ -37,8 +38,8 @@ def check_stopped() -> None:
 def whats_written() -> str:
     """What a command that ends early has written all the same, whole."""
     written = getattr(sys.modules.get("wepose_pin.documents"), "written", ())
-    folders = [folder for folder in written if folder.exists()]
-    return f"{', '.join(map(str, folders))} was written before" if folders else "nothing was written"
+    folders = [str(folder) for folder in written if folder.exists()]
+    return f"{', '.join(folders)} was written before" if folders else "nothing was written"
 
 
 @contextlib.contextmanager
@@ -57,7 +58,7 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
         looked = True
         return bool(requests or _stopped)
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, ask) for number in _SIGNALS}
     try:
         yield is_asked
     finally:

@@ -36,12 +36,10 @@ def view(
     import webbrowser
 
     from ..documents import check_file, whole_file
-    from ..recording import check_selection
     from ..report.viewer import pose_html
     from ..writers import read_result
     from ..writers.result import read_phases
 
-    check_selection(interval, phase)
     if out is None and (interval is not None or phase is not None):
         option = f"phase {phase}" if interval is None else "interval {:g} {:g}".format(*interval)
         raise BadOption(f"--{option}: needs -o FILE; view.html in the result shows the whole recording")

@@ -61,22 +61,19 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
     figures : of `draw_figures`; the page shows the first of them
     """
     over_time = [figure for name, figure in figures.items() if name.startswith("angles")][:1]
+    repetitions = [figures["repetitions"]] if "repetitions" in figures else []
     curves = [name for name in figures if name.startswith("curves")]
-    shown = curves[: MOST_FIGURES - len(over_time) - ("repetitions" in figures)]
+    shown = curves[: MOST_FIGURES - len(over_time) - len(repetitions)]
     rest = [f"`{name}.svg`" for name in curves[len(shown) :]]
-    beside = f" Beside this page: {listed(rest)}." if rest else ""
+    further = f" Further figures in the folder: {listed(rest)}." if rest else ""
     missing = explain_missing(movements)
     comparisons = tabulate_comparisons(tables["comparison"])
     return render_page(
         f"Joint angles of {' and '.join(movement.name for movement in movements)}",
         [_describe_reliance(tables["summary"]), tabulate_sessions(tables["sessions"]), _describe(movements)],
         {
-            "Repetitions": [
-                *missing,
-                *([ADVICE] if missing else []),
-                *([figures["repetitions"]] if "repetitions" in figures else []),
-            ],
-            "Mean curves": [CURVES + beside, *(figures[name] for name in shown)] if shown else [],
+            "Repetitions": [*missing, *([ADVICE] if missing else []), *repetitions],
+            "Mean curves": [CURVES + further, *(figures[name] for name in shown)] if shown else [],
             "Means over the repetitions": [tabulate_means(tables["summary"])] if len(tables["summary"]) else [],
             "Sessions compared": [COMPARISON, *comparisons] if comparisons else [],
             "All of the time": [WHOLE_TIME, *over_time, _tabulate_whole_time(tables["phases"])],
@@ -103,17 +100,19 @@ def _describe_reliance(summary: pl.DataFrame) -> str:
     several = len(summary) and summary["session"].n_unique() > 1
     for row in summary.iter_rows(named=True):
         angle = _name(row) + (f" ({row['session']})" if several else "")
-        stated[angle], between[angle] = row["range_std_deg"], row["range_sd_deg"]
-    stated, between = ({name: v for name, v in each.items() if np.isfinite(v)} for each in (stated, between))
+        if np.isfinite(row["range_std_deg"]):
+            stated[angle] = row["range_std_deg"]
+        if np.isfinite(row["range_sd_deg"]):
+            between[angle] = row["range_sd_deg"]
     if not between:
         return "No repetitions were found, so this page has no mean curves. The table covers the whole recording."
     worst = max(between, key=between.__getitem__)
-    spread = f"Between repetitions the range of {worst} varies most, by ± {between[worst]:.1f}°."
+    varies = f"Between repetitions the range of {worst} varies most, by ± {between[worst]:.1f}°."
     if not stated:
-        return f"The pose states no uncertainty of a single repetition. {spread}"
+        return f"The pose states no uncertainty of a single repetition. {varies}"
     best, least = min(stated, key=stated.__getitem__), max(stated, key=stated.__getitem__)
     known = f"{stated[best]:.1f}° ({best}) up to ± {stated[least]:.1f}° ({least})"
-    return f"The range of one repetition is known to ± {known}. {spread}"
+    return f"The range of one repetition is known to ± {known}. {varies}"
 
 
 def _describe(movements: Sequence[Movement]) -> str:
@@ -144,7 +143,7 @@ def tabulate_sessions(sessions: pl.DataFrame) -> Table:
             f"{row['from_s']:g} to {row['to_s']:g} s",
             f"{plain(row['repetitions_by'])} {row['first']}".strip(),
             str(row["n"]),
-            f"{plus_minus(row['duration_mean_s'], row['duration_sd_s'], ' s', 2)}" if row["n"] else "",
+            plus_minus(row["duration_mean_s"], row["duration_sd_s"], " s", 2) if row["n"] else "",
             number(row["cmc"], 2, unknown=""),
             str(row["left_out"] or ""),
         ]
@@ -155,31 +154,30 @@ def tabulate_sessions(sessions: pl.DataFrame) -> Table:
 
 def tabulate_means(summary: pl.DataFrame) -> Table:
     """Mean ± standard deviation between the repetitions of each angle, with what the pose states for one."""
-    rows = []
-    place = {name: k for k, name in reversed([*enumerate(map(_name, summary.iter_rows(named=True)))])}
-    for row in sorted(summary.iter_rows(named=True), key=lambda row: place[_name(row)]):
+    rows: dict[str, list[list[str]]] = {}  # angle → a row a session
+    for row in summary.iter_rows(named=True):
         cells = []
         for measure, unit in MEASURES.items():
             mean, sd, std = (row[f"{measure}_{part}_{unit}"] for part in ("mean", "sd", "std"))
-            cells.append(plus_minus(mean, sd) + (f" [{std:.1f}]" if np.isfinite(std) else "") if mean == mean else "")
-        rows.append([_name(row), row["session"], *cells, number(row["cmc"], 2, unknown="")])
+            stated = f" [{std:.1f}]" if np.isfinite(std) else ""
+            cells.append(plus_minus(mean, sd) + stated if np.isfinite(mean) else "")
+        rows.setdefault(_name(row), []).append([row["session"], *cells, number(row["cmc"], 2, unknown="")])
     title = "Mean ± standard deviation between the repetitions, in square brackets what the pose states for one"
-    return Table(title, ["angle", "session", *HEADINGS, "CMC"], rows)
+    cells_by_angle = [[angle, *cells] for angle, sessions in rows.items() for cells in sessions]
+    return Table(title, ["angle", "session", *HEADINGS, "CMC"], cells_by_angle)
 
 
 def tabulate_comparisons(comparison: pl.DataFrame) -> list[Table]:
     """A table of each further session against the first."""
     tables: dict[str, dict[str, list[str]]] = {}
-    for row in (
-        comparison.filter(pl.col("measure").is_in(list(MEASURES))).iter_rows(named=True) if len(comparison) else ()
-    ):
-        table = tables.setdefault(f"{row['session']} less {row['against']}", {})
+    for row in comparison.iter_rows(named=True):
         value, low, high, std = (row[key] for key in ("difference", "ci95_low", "ci95_high", "difference_std"))
         text = number(value, 1, sign="+", unknown="")
         if np.isfinite(low):
             text += f" ({number(low, 1, sign='+')} to {number(high, 1, sign='+')})"
             if (low > 0.0 or high < 0.0) and abs(value) > CLEAR * np.nan_to_num(std):
                 text = f"**{text}**"
+        table = tables.setdefault(f"{row['session']} less {row['against']}", {})
         table.setdefault(_name(row), []).append(text)
     return [
         Table(title, ["angle", *HEADINGS], [[angle, *cells] for angle, cells in table.items()])
@@ -206,10 +204,9 @@ def draw_figures(movements: Sequence[Movement]) -> Figures:
     repeating = [(k, each) for k, each in enumerate(movements) if each.repetitions.source in list_angles(each.angles)]
     if repeating:  # a phase does not mark them in all
         figures["repetitions"] = _draw_repetitions(repeating)
-    shown = [(k, movement) for k, movement in enumerate(movements) if movement.curves]
-    joints = dict.fromkeys(joint for _, movement in shown for joint in movement.curves)
+    joints = dict.fromkeys(joint for movement in movements for joint in movement.curves)
     for group, members in group_sides(joints).items():
-        sessions = [(k, movement) for k, movement in shown if set(members.values()) & set(movement.curves)]
+        sessions = [(k, each) for k, each in enumerate(movements) if set(members.values()) & set(each.curves)]
         figures[f"curves-{group}"] = _draw_curves(sessions, group, members)
     for k, movement in enumerate(movements, 1):
         name = f"angles-{k}" if len(movements) > 1 else "angles"
@@ -251,15 +248,14 @@ def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure
     """The angle by which repetitions were found over time, a row a session."""
     figure = ReportFigure("The main angle over time. Shaded, in turns: the repetitions.", 1.5 * len(repeating))
     for ax, (k, movement) in zip(figure.grid(len(repeating))[:, 0], repeating, strict=True):
-        spans, source, time = movement.repetitions.spans, movement.repetitions.source, movement.angles.time
+        spans, source = movement.repetitions.spans, movement.repetitions.source
         joint, place = list_angles(movement.angles)[source]
-        each = movement.angles[joint]
-        n = f"n = {len(spans)}" if len(spans) else "no repetitions"
-        ax.set_title(f"{movement.name}: {plain(source)} [°], {n}")
+        ax.set_title(f"{movement.name}: {plain(source)} [°], {len(spans) or 'no'} repetitions")
         shade(ax, spans[::2], "", SHADE)
         shade(ax, spans[1::2], "", BAND)
+        each = movement.angles[joint]
         values = np.degrees(np.where(each.hidden(place), np.nan, each.values[:, place]))
-        ax.plot(*envelope(time, values), **_session_style(k))
+        ax.plot(*envelope(movement.angles.time, values), **_session_style(k))
     figure.axes[-1].set_xlabel("time [s]")
     return figure
 
@@ -267,21 +263,20 @@ def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure
 def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: dict[str, str]) -> ReportFigure:
     """A joint's three angles from 0 to 100 % of the repetition, left above right."""
     first = next(each.angles[joint] for _, each in sessions for joint in members.values() if joint in each.curves)
-    cutoff = sessions[0][1].cutoff_hz
+    cutoff, alone = sessions[0][1].cutoff_hz, len(sessions) == 1
     filtered = "not low-passed" if cutoff is None else f"low-passed at {cutoff:g} Hz (half amplitude)"
     figure = ReportFigure(
         f"The {plain(group)} over the repetition, sequence {'-'.join(first.sequence)}, {filtered}. Line: mean over n "
-        f"repetitions. Band: ± one standard deviation between them.{' Thin: the repetitions.' * (len(sessions) == 1)}",
+        f"repetitions. Band: ± one standard deviation between them.{' Thin: the repetitions.' * alone}",
         1.7 * len(members),
     )
     for row, joint in zip(figure.grid(len(members), 3, sharex=True, sharey="col"), members.values(), strict=True):
         for place, ax in enumerate(row):
             ax.set_title(f"{plain(joint)}: {plain(first.names[place])} [°]")
             ax.set_xlim(0.0, 100.0)
-            for k, movement in sessions:
-                if joint in movement.curves:
-                    label = f"{movement.name}, n = {len(movement.repetitions.spans)}"
-                    _draw_curve(ax, movement.curves[joint][place], k, label, alone=len(sessions) == 1)
+            for k, movement in [(k, each) for k, each in sessions if joint in each.curves]:
+                label = f"{movement.name}, n = {len(movement.repetitions.spans)}"
+                _draw_curve(ax, movement.curves[joint][place], {**_session_style(k), "label": label}, alone)
     for ax in row:
         ax.set_xlabel("repetition [%]")
         low, high = ax.get_ylim()
@@ -291,14 +286,13 @@ def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: 
     return figure
 
 
-def _draw_curve(ax: Axes, curve: MeanCurve, k: int, label: str, *, alone: bool) -> None:
+def _draw_curve(ax: Axes, curve: MeanCurve, style: Mapping[str, Any], alone: bool) -> None:
     mean, sd = np.degrees(curve.mean), np.degrees(curve.sd)
     if not np.isfinite(mean).any():
         ax.text(50.0, 0.0, "not determined (near gimbal lock)", ha="center", color=SOFT)
         return
-    style = _session_style(k)
     ax.fill_between(PERCENT, mean - sd, mean + sd, color=style["color"], alpha=0.2, linewidth=0)
     if alone:
         each = np.where(np.isfinite(mean), np.degrees(curve.curves[:MOST_CURVES]), np.nan)
         ax.plot(PERCENT, each.T, color=SOFT, linewidth=0.3)
-    ax.plot(PERCENT, mean, **style, linewidth=1.8, label=label)
+    ax.plot(PERCENT, mean, **style, linewidth=1.8)

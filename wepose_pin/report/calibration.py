@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body.kinematics import Pose
 from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration
 from ..calibration.result import MIN_CONTACT, find_intervals
@@ -19,7 +18,7 @@ from ..tracking import Tracker, TrackOptions, TrackResult
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
 from .page import Banner, Item, render_page, write_pages
 from .viewer import show_motion
-from .words import Table, capital, intervals, kinds, listed, number, plain, plus_minus
+from .words import Table, capital, intervals, kinds, listed, number, plain, plus_minus, spread
 
 QUALITIES = {
     "pass": "**Pass:** the calibration is good to use.",
@@ -72,12 +71,10 @@ def _name_gap(calibration: Calibration) -> str:
     """What the gap of the protocol's closures is, as "palm to palm"."""
     closures, table = calibration.problem.protocol.closures, calibration.problem.model.table
     points = dict.fromkeys(point for closure in closures for point in closure.points)
-    each = [plain(table.shared_name(point)) for point in points]
-    if len(each) < 2:
-        return f"{each[0]} to its point" if each else "gap"
     several = listed(kinds(table, points))
-    gaps = {"coincide": " to ".join(each), "plane": f"{several} against the plane"}
-    return gaps.get(closures[0].kind, f"{several} to their points")
+    if closures and closures[0].kind == "coincide":
+        return " to ".join(plain(table.shared_name(point)) for point in points)
+    return f"gap of the {several}" if points else "gap"
 
 
 # Sections -------------------------------------------------------------------------------------------------------------
@@ -86,8 +83,7 @@ def _name_gap(calibration: Calibration) -> str:
 def _describe_reliance(calibration: Calibration) -> str:
     """Two sentences: how well the lengths are known, and the mounts."""
     subject, chain = calibration.subject, calibration.problem.lengths_in_closures
-    stds = {name: 1e3 * subject.std(name) for name in chain or subject.lengths}
-    stds = {name: std for name, std in stds.items() if np.isfinite(std)}
+    stds = {name: std for name in chain or subject.lengths if np.isfinite(std := 1e3 * subject.std(name))}
     text = "The uncertainty of the lengths is not known."
     if stds:
         worst = max(stds, key=stds.__getitem__)
@@ -95,8 +91,7 @@ def _describe_reliance(calibration: Calibration) -> str:
         text += f", their common scale to ± {100 * calibration.scale_std:.1f} %." if chain else "."
         if calibration.formulation == "paper":
             text += " These ± leave out errors of mounts, headings and soft tissue, and are too small."
-    mounts = {name: _find_mount_stds(subject, name) for name in subject.mounts}
-    mounts = {name: std for name, std in mounts.items() if np.isfinite(std).all()}
+    mounts = {name: both for name in subject.mounts if np.isfinite(both := _find_mount_stds(subject, name)).all()}
     if mounts:
         worst = max(mounts, key=lambda name: max(mounts[name]))
         tilt, heading = mounts[worst]
@@ -130,11 +125,11 @@ def tabulate_lengths(calibration: Calibration) -> Table:
             plus_minus(1e3 * person.lengths.get(name, np.nan), 1e3 * person.std(name))
             for person in (subject, problem.prior)
         )
-        of_scale = calibration.scale_std * value
-        proportion = 1e3 * np.sqrt(max(subject.std(name) ** 2 - of_scale**2, 0.0))
-        in_chain = name in problem.lengths_in_closures and np.isfinite(proportion)
+        variance = subject.std(name) ** 2 - (calibration.scale_std * value) ** 2
+        in_chain = name in problem.lengths_in_closures and np.isfinite(variance)
+        proportion = spread(1e3 * np.sqrt(max(variance, 0.0)), 0) if in_chain else ""
         measured = number(1e3 * problem.measured[name][0], 0) if name in problem.measured else ""
-        rows.append([plain(name), f"**{estimated}**", f"± {proportion:.0f}" if in_chain else "", before, measured])
+        rows.append([plain(name), f"**{estimated}**", proportion, before, measured])
     return Table("", ["length [mm]", "estimated", "its proportion alone", "prior", "measured"], rows)
 
 
@@ -144,34 +139,25 @@ def tabulate_mounts(calibration: Calibration) -> Table:
     for name, quat_LS in subject.mounts.items():
         offset, drift = subject.start_pose_offset.get(name), subject.heading_drift.get(name)
         up, forward = find_mount_axes(quat_LS)
-        nearest = Rotation.from_quat(compute_mount(up, forward))
-        off = np.degrees((nearest.inv() * Rotation.from_quat(quat_LS)).magnitude())
-        rows.append(
-            [
-                plain(name),
-                f"{up} up, {forward} ahead, turned {off:.0f}°".replace("-", "−"),
-                *(number(std, 1, "°") for std in _find_mount_stds(subject, name)),
-                number(float(np.degrees(np.linalg.norm(offset.tilt))) if offset else np.nan, 1, "°"),
-                number(float(np.degrees(drift.rate)) * 60.0, 1, " °/min", "+") if drift else "",
-            ]
-        )
+        off = (Rotation.from_quat(compute_mount(up, forward)).inv() * Rotation.from_quat(quat_LS)).magnitude()
+        axes = f"{up} up, {forward} ahead, turned {np.degrees(off):.0f}°".replace("-", "−")
+        stds = (number(std, 1, "°") for std in _find_mount_stds(subject, name))
+        at_start = number(np.degrees(np.linalg.norm(offset.tilt)) if offset else np.nan, 1, "°")
+        rate = number(60.0 * np.degrees(drift.rate), 1, " °/min", "+") if drift else ""
+        rows.append([plain(name), axes, *stds, at_start, rate])
     return Table("", ["sensor", "nearest axes", "tilt ±", "heading ±", "off at start", "drift"], rows)
 
 
 def _list_sensors(calibration: Calibration) -> list[Item]:
-    table = tabulate_mounts(calibration)
-    if not table.rows:
-        return []
     soft = [f"{plain(joint)} {np.degrees(rms):.1f}°" for joint, rms in calibration.hinge_rms.items()]
-    hinges = (
-        f" Out of the plane of its hinge, root mean square, a segment rotates by: {', '.join(soft)}." if soft else ""
-    )
-    return [
+    text = (
         "Which axes of each sensor point up and forward, and the angle from there. Nobody stands exactly in the start "
         "pose: by how much each segment was off was estimated with the lengths. `subject.toml` has the directions, "
-        f"and the exact rotations.{hinges}",
-        table,
-    ]
+        "and the exact rotations."
+    )
+    if soft:
+        text += f" Out of the plane of its hinge, root mean square, a segment rotates by: {', '.join(soft)}."
+    return [text, tabulate_mounts(calibration)] if calibration.subject.mounts else []
 
 
 def describe_gap(calibration: Calibration) -> str:
@@ -200,37 +186,27 @@ def _list_view(calibration: Calibration, recording: Recording, tracked: TrackRes
             tracked = tracker.push(recording) or next(tracker.smooth())
         except WeposeError as error:
             return [f"The motion cannot be tracked: {error}"]
-    begin, end = float(calibration.time.min()), float(calibration.time.max())
-    samples = slice(*np.searchsorted(tracked.time, [begin - 1e-6, end + 1e-6]))
+    first, last = calibration.time.min() - 1e-6, calibration.time.max() + 1e-6
+    samples = slice(*np.searchsorted(tracked.time, [first, last]).tolist())
     if samples.stop - samples.start < 2:
         return []
-    cut = Pose(
-        tracked.time[samples],
-        {name: quat[samples] for name, quat in tracked.quat_WL.items()},
-        {name: points[samples] for name, points in tracked.points.items()},
-    )
-    phases = {
-        name: [(max(a, begin), min(b, end)) for a, b in spans if b > begin and a < end]
-        for name, spans in recording.phases.items()
-    }
-    shown = {name: spans for name, spans in phases.items() if spans}
-    return [show_motion(tracked.model, cut, shown, recording.name)]
+    return [show_motion(tracked.model, tracked.pose.cut(samples), recording.phases, recording.name)]
 
 
 def _tabulate_run(calibration: Calibration, recording: Recording, method: str) -> Table:
-    lengths = {name: calibration.measured_lengths[name] for name in calibration.problem.measured}
-    measured = [f"{plain(n)} {1e3 * v.metres:.0f} ± {1e3 * v.measured_std:.0f} mm" for n, v in lengths.items()]
-    imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
-    raw = ["gyroscope and accelerometer"] * (imu > 0) + ["measured orientations"] * (fused > 0)
+    problem, lengths = calibration.problem, calibration.measured_lengths
+    measured = [
+        f"{plain(n)} {1e3 * lengths[n].metres:.0f} ± {1e3 * lengths[n].measured_std:.0f} mm" for n in problem.measured
+    ]
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("sensors", f"{', '.join(map(plain, recording.sensors))} ({', '.join(raw)})"),
+        ("sensors", ", ".join(map(plain, recording.sensors))),
         ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
         ("phases", "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())),
-        ("protocol", f"{calibration.problem.protocol.name}, {len(calibration.time)} samples of it"),
-        ("filter", method),
+        ("protocol", f"{problem.protocol.name}, {len(calibration.time)} samples of it"),
+        ("filter", method if recording.imus else "none: measured orientations"),
         ("measured lengths", ", ".join(measured) or "none"),
-        ("prior", calibration.problem.prior.note or calibration.problem.prior.name),
+        ("prior", problem.prior.note or problem.prior.name),
         ("sensors mounted again", "yes" if recording.remounted else "no"),
     ]
     return Table("", (), rows)
@@ -278,30 +254,23 @@ def draw_gap(calibration: Calibration, label: str) -> ReportFigure:
     order = np.argsort(calibration.time, kind="stable")
     order = order[np.isfinite(calibration.gap[order])]
     time, touched = calibration.time[order], calibration.contact[order] >= MIN_CONTACT
-    gaps = {
-        "with the prior's lengths": 1e3 * calibration.prior_gap[order],
-        "with the estimated lengths": 1e3 * calibration.gap[order],
-    }
-    styles = {
-        name: {"color": COLOURS[side], "linestyle": dashes, "label": name}
-        for name, side, dashes in zip(gaps, ("left", "right"), ("--", "-"), strict=True)
-    }
-    half = 0.5 * float(np.median(np.diff(time)))
-    apart = [(begin - half, end + half) for begin, end in find_intervals(time, ~touched)]
+    step = float(np.median(np.diff(time)))
+    jumps = np.flatnonzero(np.diff(time) > 3.0 * step) + 1  # where a line breaks
+    gaps, styles = {}, {}
+    for name, gap, side, dashes in (
+        ("with the prior's lengths", calibration.prior_gap, "left", "--"),
+        ("with the estimated lengths", calibration.gap, "right", "-"),
+    ):
+        gaps[name] = np.insert(1e3 * gap[order], jumps, np.nan)
+        styles[name] = {"color": COLOURS[side], "linestyle": dashes, "label": name}
     figure = draw_over_time(
-        insert_breaks(time, time),
-        {f"{label} [mm]": {name: insert_breaks(time, gap) for name, gap in gaps.items()}},
+        np.insert(time, jumps, time[jumps]),
+        {f"{label} [mm]": gaps},
         f"{label} over time, before and after.",
         styles,
-        spans=("apart, left out", apart),
+        spans=("apart, left out", [(a - 0.5 * step, b + 0.5 * step) for a, b in find_intervals(time, ~touched)]),
     )
-    usual = np.concatenate([gap[touched] if touched.any() else gap for gap in gaps.values()])
-    most = max(float(np.nanmax(usual, initial=1.0)), 1.0)  # lines may leave the plot while apart
-    figure.axes[0].set_ylim(0.0, 1.12 * most)
+    shown = order[touched] if touched.any() else order
+    usual = 1e3 * np.concatenate([calibration.gap[shown], calibration.prior_gap[shown]])
+    figure.axes[0].set_ylim(0.0, 1.12 * float(np.nanmax(usual, initial=1.0)))  # lines may leave the plot while apart
     return figure
-
-
-def insert_breaks(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (n,) with a NaN inserted wherever time jumps, so that a line breaks there."""
-    jumps = np.flatnonzero(np.diff(time) > 3.0 * np.median(np.diff(time))) + 1
-    return np.insert(values.astype(float), jumps, time[jumps] if values is time else np.nan)

@@ -21,6 +21,7 @@ from .words import plain
 
 WIDTH_IN = 9.2
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = 0.62, 0.12, 0.28, 0.5  # margins of a figure
+LEGEND_COLUMNS = 6
 COLUMNS = 450  # of a line: its least and largest value in each
 COLOURS = {"left": "#d9772b", "right": "#24618f", "other": "#3d4a59"}
 SESSION_COLOURS = ("#24618f", "#d9772b", "#3d7a4c", "#8a5a9e")
@@ -64,13 +65,7 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 class ReportFigure(Figure):
-    """A matplotlib figure with a caption; a notebook shows it.
-
-    Parameters
-    ----------
-    caption : what it shows, in a sentence or two
-    height_in : of the plots, without margins and legend
-    """
+    """A matplotlib figure with a caption; a notebook shows it. `height_in`: without margins and legend."""
 
     def __init__(self, caption: str, height_in: float) -> None:
         super().__init__(figsize=(WIDTH_IN, height_in + TOP_IN + BOTTOM_IN))
@@ -101,19 +96,14 @@ class ReportFigure(Figure):
                 entries.setdefault(label, handle)
         if not entries:
             return
-        columns = 6
-        extra = 0.22 * -(-len(entries) // columns)
         width, height = self.get_size_inches()
-        self.set_size_inches(width, height + extra)
+        taller = height + 0.22 * -(-len(entries) // LEGEND_COLUMNS)
+        self.set_size_inches(width, taller)
         for ax in self.axes:
-            place = ax.get_position()
-            ax.set_position((place.x0, place.y0 * height / (height + extra), place.width,
-                             place.height * height / (height + extra)))  # fmt: skip
-        self.legend(
-            list(entries.values()),
-            list(entries), loc="upper left", ncols=columns, borderaxespad=0.1,
-            bbox_to_anchor=(0.01, 1.0), handlelength=2.2, columnspacing=1.6,
-        )  # fmt: skip
+            x, y, w, h = ax.get_position().bounds
+            ax.set_position((x, y * height / taller, w, h * height / taller))
+        look = {"ncols": LEGEND_COLUMNS, "borderaxespad": 0.1, "handlelength": 2.2, "columnspacing": 1.6}
+        self.legend(list(entries.values()), list(entries), loc="upper left", bbox_to_anchor=(0.01, 1.0), **look)
 
     @styled
     def svg(self) -> str:
@@ -143,13 +133,7 @@ class Figures(dict[str, ReportFigure]):
         return "\n".join(figure.svg().partition("?>")[2] for figure in self.values())
 
     def save(self, folder: str | Path, force: bool = False) -> Path:
-        """Write each figure to ``<name>.svg`` in a folder and return the folder.
-
-        Raises
-        ------
-        ExistingOutput
-            The folder is not empty and `force` is not given, or it cannot be written.
-        """
+        """Write each figure to ``<name>.svg`` in a folder and return it; `ExistingOutput` as `whole_folder`."""
         with whole_folder(Path(folder), force) as partial:
             for name, figure in self.items():
                 (partial / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")
@@ -176,15 +160,11 @@ def envelope(time: np.ndarray, values: np.ndarray, most: int = COLUMNS) -> tuple
 
 
 def find_spans(time: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """(m, 2) [s], runs of true values; those nearer to each other than a column are one, so that m has a bound."""
-    least = max(1, len(time) // (2 * COLUMNS))
-    merged: list[list[int]] = []
-    for a, b in find_runs(which):
-        if merged and a - merged[-1][1] < least:
-            merged[-1][1] = b
-        else:
-            merged.append([a, b])
-    return np.array([(time[a], time[b - 1]) for a, b in merged]).reshape(-1, 2)
+    """(m, 2) [s], runs of true values, in steps of a column, so that m has a bound."""
+    starts = np.arange(0, len(time), max(1, len(time) // (2 * COLUMNS)))
+    ends = np.append(starts[1:], len(time)) - 1
+    runs = find_runs(np.logical_or.reduceat(which, starts))
+    return np.array([(time[starts[a]], time[ends[b - 1]]) for a, b in runs]).reshape(-1, 2)
 
 
 def shade(ax: Axes, spans: Spans, label: str, colour: str = SHADE, **options: Any) -> None:

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, select_autoescape
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, lines
@@ -50,26 +50,16 @@ Item: TypeAlias = str | Banner | Table | Frame | Picture  # a text is a paragrap
 
 
 def render_page(title: str, lead: Sequence[Item], sections: Mapping[str, Sequence[Item]]) -> str:
-    """The whole page; the same items give the same text.
-
-    Parameters
-    ----------
-    title : the heading
-    lead : what stands before all sections
-    sections : heading → items, in order; one without items is left out
-    """
+    """The whole page: `lead`, then heading → items, without those that have none; the same items give the same text."""
     shown = {heading: items for heading, items in {"": lead, **sections}.items() if items}
     scripts = any(isinstance(item, Frame) for items in shown.values() for item in items)
     return load_template("report/templates/page.html.j2").render(title=title, sections=shown, scripts=scripts)
 
 
 def show_diagnostics(diagnostics: Sequence[Diagnostic], reliable: str, *, unusable: bool = False) -> Banner:
-    """The banner of a page's diagnostics.
+    """The banner of a page's diagnostics; `reliable` is what it says where there are none.
 
-    Parameters
-    ----------
-    reliable : what it says where there are none
-    unusable : whether it warns even without a diagnostic that does
+    `unusable`: it warns even without a diagnostic that does.
     """
     entries = lines(diagnostics, titled=True)
     if unusable or any(diagnostic.severity != INFO for diagnostic in diagnostics):
@@ -86,7 +76,7 @@ def load_template(name: str) -> Template:
 def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(PACKAGE),
-        autoescape=select_autoescape(disabled_extensions=("md.j2",), default=True),
+        autoescape=True,
         undefined=StrictUndefined,
         lstrip_blocks=True,
         trim_blocks=True,
@@ -114,12 +104,7 @@ def write_pages(folder: Path, pages: Mapping[str, Callable[[], str]], summary: s
     Parameters
     ----------
     pages : name of a file → what makes its text
-    summary : JSON file of the result, whose ``diagnostics`` get those of the pages
-
-    Returns
-    -------
-    list of Diagnostic
-        Pages that cannot be made.
+    summary : JSON file of the result, whose ``diagnostics`` get those of pages that cannot be made, which are returned
     """
     for name in pages:
         with contextlib.suppress(OSError):

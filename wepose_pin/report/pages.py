@@ -28,18 +28,7 @@ FRAME_HEIGHT = 560  # [px] of the view page in a notebook
 def write_track_pages(
     folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True, fps: float = 30.0
 ) -> list[Diagnostic]:
-    """Write ``view.html`` and ``report.html`` beside a result that is there already.
-
-    Parameters
-    ----------
-    view, report : which of them
-    fps : of ``view.html``
-
-    Returns
-    -------
-    list of Diagnostic
-        Pages that cannot be made; they stand in ``summary.json`` too.
-    """
+    """Write ``view.html``, with so many frames a second, and ``report.html`` beside a result; as `write_pages`."""
     tracked, recording = summary.tracked, summary.tracked.recording
 
     @cache
@@ -75,15 +64,9 @@ def save_result(result: TrackResult, folder: str | Path, force: bool = False) ->
 
 @dataclass(frozen=True)
 class ViewPage:
-    """The page that plays a motion; a notebook shows it in a frame.
+    """The page that plays a motion, which opens offline; a notebook shows it in a frame."""
 
-    Parameters
-    ----------
-    title : of the motion
-    html : the whole page, which opens offline
-    """
-
-    title: str
+    title: str  # of the motion
     html: str
 
     def __repr__(self) -> str:
@@ -97,13 +80,7 @@ class ViewPage:
         )
 
     def save(self, path: str | Path, force: bool = False) -> Path:
-        """Write the page to a file and return its path.
-
-        Raises
-        ------
-        ExistingOutput
-            The file is there and `force` is not given, or it cannot be written.
-        """
+        """Write the page to a file and return its path; `ExistingOutput` where it is there, without `force`."""
         with whole_file(Path(path), force) as partial:
             partial.write_text(self.html, encoding="utf-8")
         return Path(path)

@@ -1,4 +1,4 @@
-"""The report of a robot's trajectory: the hands and why they are off, distances of the robot's parts, joint limits."""
+"""The report of a robot's trajectory: the hands and why they are off, the distance of its parts, joint limits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ..diagnostics import from_json
 from ..retargeting import Trajectory
-from ..retargeting.collision import CLEARANCE, NEAR
+from ..retargeting.collision import CLEARANCE
 from ..retargeting.files import CAUSES, FAR, find_error_causes
 from .figures import (
     ALARM,
@@ -21,14 +21,12 @@ from .figures import (
     envelope,
     find_spans,
     line_style,
-    shade,
     styled,
 )
 from .page import Frame, Item, render_page, show_diagnostics
 from .words import Table, number, plain
 
 CAUSE_COLOURS = (ALARM, *SESSION_COLOURS, SOFT)  # of `CAUSES`
-PAIRS = 8  # that are listed, the closest ones
 
 
 def render_retargeting_report(
@@ -42,18 +40,17 @@ def render_retargeting_report(
     title : what moves what, for the heading
     view : the page of `retarget_html`, embedded; None: left out
     """
-    diagnostics = [from_json(entry) for entry in summary["diagnostics"]]
     runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]
     reliable = "**Limits kept, no self-collision,** nothing had to be slowed."
     return render_page(
         f"Motion of {title or 'a robot'}",
         [
             describe_reliance(trajectory, summary),
-            show_diagnostics(diagnostics, reliable, unusable=not runnable),
+            show_diagnostics([*map(from_json, summary["diagnostics"])], reliable, unusable=not runnable),
         ],
         {
             "The hands against their targets": [draw_hands(trajectory), *tabulate_hands(summary)],
-            "The robot's parts against each other": _list_distances(trajectory, summary),
+            "The robot's parts against each other": [_describe_distances(trajectory, summary)],
             "The joints against their limits": _list_joints(trajectory, summary),
             "The motion in 3D": [] if view is None else [Frame(view, " Translucent: the targets of the hands.")],
             "What was run": [tabulate_run(summary)],
@@ -116,41 +113,32 @@ def describe_limits(summary: Mapping[str, Any]) -> str:
     )
 
 
-def _list_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
-    report, time, contacts = trajectory.run.report, trajectory.time, summary["self_collisions"]
-    rows = []
-    for pair in np.unique(report.nearest_pair[report.nearest_pair >= 0]).tolist():
-        own = np.flatnonzero(report.nearest_pair == pair)
-        least = own[np.argmin(report.hull_distance[own])]
-        name, share = trajectory.collision.name_pair(pair), 100.0 * len(own) / len(time)
-        rows.append((float(report.hull_distance[least]), name, float(time[least]), share))
-    cells = [[name, f"{1e3 * d:.1f}", f"{t:.1f}", f"{share:.0f}"] for d, name, t, share in sorted(rows)[:PAIRS]]
-    header = ["pair", "least distance [mm]", "at [s]", "closest pair for [% of the time]"]
-    return [
-        draw_distances(trajectory),
-        *([Table("", header, cells)] if cells else []),
-        "Distances are those of convex hulls, which are larger than the parts. The parts themselves, "
-        f"{contacts['pairs']} pairs of them, collide in {contacts['samples']} samples.",
-    ]
+def _describe_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> str:
+    distance, contacts = trajectory.run.report.hull_distance, summary["self_collisions"]
+    text = "Distances are those of convex hulls, which are larger than the parts."
+    if np.isfinite(distance).any():
+        k = int(np.nanargmin(distance))
+        pair = trajectory.collision.name_pair(int(trajectory.run.report.nearest_pair[k]))
+        text += (
+            f" The least is {1e3 * distance[k]:.1f} mm, of {pair} at {trajectory.time[k]:.1f} s; the controller keeps "
+            f"{1e3 * CLEARANCE:g} mm."
+        )
+    return text + f" The parts themselves, {contacts['pairs']} pairs of them, collide in {contacts['samples']} samples."
 
 
 def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
-    robot, run = trajectory.robot, trajectory.run
+    robot, run, margins = trajectory.robot, trajectory.run, trajectory.robot.margins
     limits, dt = robot.map.read_joint_limits(), float(trajectory.time[1] - trajectory.time[0])
-    jerk = np.abs(np.diff(run.joint_acceleration, axis=0)) / dt
+    jerk = np.diff(run.joint_acceleration, axis=0) / dt
     rows = []
     for j in (j for arm in robot.arms for j in arm.joints.tolist()):
-        name, position = robot.names[j], run.joint_position[:, j]
-        limit, (factor, unit) = limits[name], _choose_unit(limits[name].kind)
+        name, position, limit = robot.names[j], run.joint_position[:, j], limits[robot.names[j]]
+        factor, unit = _choose_unit(limit.kind)
         margin = factor * float(np.minimum(position - limit.lower, limit.upper - position).min())
-        used = (
-            (np.abs(run.joint_velocity[:, j]).max(), limit.velocity),
-            (np.abs(run.joint_acceleration[:, j]).max(), robot.map.acceleration[name]),
-            (jerk[:, j].max(), robot.map.jerk[name]),
-        )
-        shares = [f"{100.0 * value / most:.0f} % of {most:g}" for value, most in used]
+        most = limit.velocity, robot.map.acceleration[name], robot.map.jerk[name]
+        used = (np.abs(values[:, j]).max() for values in (run.joint_velocity, run.joint_acceleration, jerk))
+        shares = (f"{100.0 * value / end:.0f} % of {end:g}" for value, end in zip(used, most, strict=True))
         rows.append([plain(name), number(margin, 1, f" {unit}", unknown="no limit"), *shares])
-    margins = robot.margins
     return [
         draw_joints(trajectory),
         Table("", ["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
@@ -201,22 +189,6 @@ def draw_hands(trajectory: Trajectory) -> ReportFigure:
             if (cause == k).any():
                 bars = [(a, max(b - a, time[1] - time[0])) for a, b in find_spans(time, cause == k)]
                 ax.broken_barh(bars, (-0.13 * most, 0.1 * most), facecolor=colour, label=name)
-    figure.add_legend()
-    return figure
-
-
-@styled
-def draw_distances(trajectory: Trajectory) -> ReportFigure:
-    """The smallest distance between two parts of the robot, or of one and its table."""
-    run, time = trajectory.run, trajectory.time
-    distance = np.where(np.isfinite(run.report.hull_distance), 1e3 * run.report.hull_distance, np.nan)
-    title = "closest convex hulls [mm]"
-    caption = "The smallest distance between two parts of the robot, or of one and its table."
-    figure = draw_over_time(time, {title: {title: distance}}, caption, {title: {"color": "black"}})
-    [ax] = figure.axes
-    ax.set_ylim(0.0, 1e3 * NEAR)
-    ax.axhline(1e3 * CLEARANCE, color=COLOURS["left"], linestyle="--", label="clearance")
-    shade(ax, find_spans(time, run.report.stopping), "braked", COLOURS["right"], alpha=0.4)
     figure.add_legend()
     return figure
 

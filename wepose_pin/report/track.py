@@ -26,7 +26,7 @@ from ..tracking.measures import (
     longest_run_s,
     measure_tips,
 )
-from .angles import FULL_TURN, draw_joint_angles
+from .angles import draw_joint_angles
 from .figures import (
     ALARM,
     COLOURS,
@@ -42,11 +42,10 @@ from .figures import (
 )
 from .page import Frame, Item, render_page, show_diagnostics
 from .viewer import show_motion
-from .words import Table, capital, intervals, kinds, listed, number, plain, plural
+from .words import Table, capital, intervals, kinds, listed, number, plain, plural, spread
 
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
-METHODS_WITH_COVARIANCE = "amekf, smoother, smekf and smekf_published"
 VIEWS = (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0))  # axes across and up
 AXES = ("forwards [cm]", "to the left [cm]", "upwards [cm]")
 
@@ -63,12 +62,10 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
     """
     tracked, measures = summary.tracked, summary.measures
     recording, table = tracked.recording, tracked.model.table
-    try:
+    angles = None
+    with contextlib.suppress(BadData):  # no joint has both of its segments
         angles = joint_angles(tracked.pose, AUTO)
-    except BadData:  # no joint has both of its segments
-        angles = None
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
-    reliable = f"**No warnings.** {checked} are within their limits."
     if view is not None and len(view) <= LARGEST_VIEW:
         frame = Frame(view)
     else:
@@ -77,7 +74,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
         f"Motion of {recording.name or 'a recording'}",
         [
             _describe_reliance(tracked, measures, angles),
-            show_diagnostics(summary.diagnostics, reliable),
+            show_diagnostics(summary.diagnostics, f"**No warnings.** {checked} are within their limits."),
             _describe_recording(tracked, measures),
         ],
         {
@@ -105,11 +102,11 @@ def _describe_reliance(tracked: TrackResult, measures: Measures, angles: Angles 
             std = float(np.degrees(finite_median(each.std[after_start & ~each.hidden(k), k])))
             if np.isfinite(std):
                 stds[name] = max(std, stds.get(name, 0.0))
-    tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
     hinges = [f"{plain(table.shared_name(hinge))} flexion" for hinge in table.hinges]
     best = next((name for name in stds if name in hinges), min(stds, key=stds.__getitem__, default=None))
     worst = max(stds, key=stds.__getitem__, default=None)
     known = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
+    tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
     if tips and np.isfinite(tips).any():
         root = "the root" if table.is_mechanism else "the middle of the hips"
         known.append(f"{_name_tips(table)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
@@ -124,14 +121,14 @@ def _explain_no_covariance(tracked: TrackResult) -> str:
     source = f"The filter {tracked.options.method}" if tracked.recording.imus else "The device"
     return (
         f"{source} states no uncertainty, so that this page cannot say how far angles and positions may be off. "
-        f"The methods {METHODS_WITH_COVARIANCE} state it."
+        f"The methods amekf, smoother, smekf and smekf_published state it."
     )
 
 
 def _describe_recording(tracked: TrackResult, measures: Measures) -> str:
     recording, time = tracked.recording, tracked.time
     text = (
-        f"{_format_duration(float(recording.time[-1] - recording.time[0]))} at {measures.rate_hz:g} Hz from "
+        f"{recording.time[-1] - recording.time[0]:.0f} s at {measures.rate_hz:g} Hz from "
         f"{len(measures.signals)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
         "standard deviation throughout: two times out of three the truth lies within."
     )
@@ -144,9 +141,7 @@ def _describe_recording(tracked: TrackResult, measures: Measures) -> str:
         )
     before = float(time[np.argmax(find_samples_after_start(tracked))] - time[0])
     if before >= 1.0:
-        text += (
-            f" Each ± is of the time after the start pose; the {_format_duration(before)} before its end are left out."
-        )
+        text += f" Each ± is of the time after the start pose; the {before:.0f} s before its end are left out."
     return text
 
 
@@ -154,14 +149,15 @@ def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
     rate_hz, rows = tracked.recording.rate_hz, []
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in tracked.recording.phases.items())
     for name, signal in measures.signals.items():
-        lost = [f"{np.count_nonzero(mask) / rate_hz:.2f} s" for mask in (signal.cut, signal.gap)]
-        static, biases = ["", ""], ["", "", ""]
-        if signal.static is not None:
-            static = [f"{100 * signal.static.mean():.0f} %", f"{longest_run_s(~signal.static, rate_hz):.0f} s"]
-        if signal.bias is not None:
-            biases = [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in signal.bias]
-            biases.append(f"{signal.gravity:.3f} m/s²")
-        rows.append([plain(name), f"{np.degrees(signal.rate.max()):.0f} °/s", *lost, *static, *biases])
+        cells = [f"{np.degrees(signal.rate.max()):.0f} °/s"]
+        cells += [f"{np.count_nonzero(mask) / rate_hz:.2f} s" for mask in (signal.cut, signal.gap)]
+        if signal.static is None or signal.bias is None:  # measured orientations
+            cells += [""] * 5
+        else:
+            cells += [f"{100 * signal.static.mean():.0f} %", f"{longest_run_s(~signal.static, rate_hz):.0f} s"]
+            cells += [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in signal.bias]
+            cells.append(f"{signal.gravity:.3f} m/s²")
+        rows.append([plain(name), *cells])
     header = ["sensor", "fastest rotation", "saturated", "lost", "static", "longest motion"]
     low, high = (f"{step:.2f}" for step in measures.steps_ms)
     return [
@@ -178,14 +174,13 @@ def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
 def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> list[Item]:
     if not headings:
         return [_explain_no_covariance(tracked)]
-    correction, table = tracked.correction, tracked.model.table
-    after_start = find_samples_after_start(tracked)
+    table, after_start = tracked.model.table, find_samples_after_start(tracked)
     text = (
         "Gravity corrects the tilt. No sensor measures the heading, the rotation about the vertical: it is set in the "
         "start pose and then drifts with the gyroscope's errors."
     )
-    if correction is not None:
-        most = max(correction.max_correction_deg.values(), default=0.0)
+    if tracked.correction is not None:
+        most = max(tracked.correction.max_correction_deg.values(), default=0.0)
         text += (
             f" What the joints and joined hands show corrected the headings by up to {most:.1f}°. This does not "
             "correct errors that all segments share, such as the heading of the whole person."
@@ -198,44 +193,37 @@ def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> lis
         ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
         rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends)])
     sides = {side: [name for name in headings if table.side(name) == side] for side in map(table.side, headings)}
-    styles = {name: line_style(name, side, rank) for side, own in sides.items() for rank, name in enumerate(own)}
     figure = draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
         "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
-        styles,
+        {name: line_style(name, side, rank) for side, own in sides.items() for rank, name in enumerate(own)},
         spans=("clasp", tracked.recording.phases.get("clasp", ())),
     )
-    header = ["segment or joint", "median ±", "largest ±", "± at the end"]
-    return [text, figure, Table("", header, rows)]
+    return [text, figure, Table("", ["segment or joint", "median ±", "largest ±", "± at the end"], rows)]
 
 
 def _list_tips(tracked: TrackResult, measures: Measures) -> list[Item]:
-    after_start = find_samples_after_start(tracked)
     groups = group_tips(measures.tips, tracked.model.table)
     if not groups:
         return []
+    after_start = find_samples_after_start(tracked)
     items: list[Item] = list(draw_tips(tracked.time, groups, tracked.model.table).values())
     for group in groups:
         rows = []
         for name, tip in group.tips.items():
             low, high = np.nanpercentile(100 * tip.reach, [1.0, 99.0], axis=0)
-            stds = (
-                [1e3 * pick(tip.std[after_start]) for pick in (finite_median, finite_max)]
-                if tip.std is not None
-                else ()
-            )
             ranges = [f"{number(a, 0)} to {number(b, 0)}" for a, b in zip(low, high, strict=True)]
-            known = [f"± {std:.0f} mm" if np.isfinite(std) else "not known" for std in stds or (np.nan, np.nan)]
-            rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *known])
+            std = np.full(1, np.nan) if tip.std is None else 1e3 * tip.std[after_start]
+            stds = [spread(each(std), 0, " mm") for each in (finite_median, finite_max)]
+            rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *stds])
         title = f"The {group.nouns}, from {group.start} along {group.frame}"
         items.append(Table(title, ["", *AXES, "highest speed", "median ±", "largest ±"], rows))
     items.append(
         "Ranges hold 98 % of the time; the highest speed is the mean of a tenth of a second. The ± is of one axis, "
         "relative to the root, and includes the lean and the lengths of all that lies between."
     )
-    items += tabulate_error_budget(measures.error_budget)
-    return items
+    return [*items, *tabulate_error_budget(measures.error_budget)]
 
 
 def tabulate_error_budget(budget: Mapping[str, Mapping[str, float]]) -> list[Table]:
@@ -251,17 +239,14 @@ def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
     for joint, ranges in summary(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
-            std = np.degrees(finite_median(stds[:, k])) if stds is not None else np.nan
-            ends = [
+            ends = (
                 number(np.degrees(each[k]), 0, "°", unknown="")
                 for each in (ranges.lowest, ranges.highest, ranges.range)
-            ]
-            if np.isfinite(ranges.range[k]) and ranges.range[k] >= FULL_TURN and ranges.near_lock:
-                ends = ["", "", "all round"]
+            )
             rate = number(np.degrees(ranges.peak_rate[k]), 0, " °/s", unknown="")
+            std = spread(np.degrees(finite_median(stds[:, k])) if stds is not None else np.nan, 1, "°")
             near_lock = f"{100 * ranges.near_lock:.0f} %" if k != 1 else ""
-            known = f"± {std:.1f}°" if np.isfinite(std) else "not known"
-            rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, known, near_lock])
+            rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, std, near_lock])
     stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
     elevation = any("elevation" in each.names for each in angles.joints.values())
     return [
@@ -341,20 +326,12 @@ def draw_timeline(tracked: TrackResult, signals: Mapping[str, Signal]) -> Report
 
 
 class TipGroup(NamedTuple):
-    """Points whose paths are drawn together, for their limbs hang on the same points.
-
-    Parameters
-    ----------
-    tips : point → its motion
-    nouns : what the points are on, as "hands"
-    start : where a reach begins, as "the middle of the shoulders"
-    frame : whose axes its coordinates are along, in words
-    """
+    """Points whose paths are drawn together, for their limbs hang on the same points; texts are in words."""
 
     tips: Mapping[str, TipMotion]
-    nouns: str
-    start: str
-    frame: str
+    nouns: str  # what the points are on, as "hands"
+    start: str  # where a reach begins, as "the middle of the shoulders"
+    frame: str  # whose axes its coordinates are along
 
 
 def group_tips(tips: Mapping[str, TipMotion], table: BodyTable) -> list[TipGroup]:
@@ -362,11 +339,17 @@ def group_tips(tips: Mapping[str, TipMotion], table: BodyTable) -> list[TipGroup
     limbs, groups = table.drawn_limbs, []
     for origin in dict.fromkeys(limbs[name].origin for name in tips):
         own = {name: tip for name, tip in tips.items() if limbs[name].origin == origin}
-        nouns = listed(kinds(table, [(limbs[name].segments or (name,))[-1] for name in own]))
         start, base = plain(table.shared_name(origin[0])), limbs[next(iter(own))].base
         start = f"the middle of the {plural(start)}" if len(origin) > 1 else f"the {start}"
-        groups.append(TipGroup(own, nouns, start, f"the {plain(base)}'s own axes" if base else "the axes of W"))
+        frame = f"the {plain(base)}'s own axes" if base else "the axes of W"
+        groups.append(TipGroup(own, _name_tips(table, own), start, frame))
     return groups
+
+
+def _name_tips(table: BodyTable, names: Mapping[str, Any] | None = None) -> str:
+    """What these points whose path is drawn, or all, are on, as "hands"."""
+    limbs = table.drawn_limbs
+    return listed(kinds(table, [(limbs[name].segments or (name,))[-1] for name in names or limbs]))
 
 
 @styled
@@ -384,7 +367,8 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
             ax.set_ylabel(AXES[up], labelpad=1)
             ax.set_aspect("equal", adjustable="datalim")
             ax.margins(0.05)
-            ax.invert_xaxis() if view == "from above" else None
+            if view == "from above":
+                ax.invert_xaxis()
             ax.plot(0.0, 0.0, "+", color=SOFT, markersize=10, label=group.start)
             for name, tip in group.tips.items():
                 at = 100.0 * tip.reach[:: max(1, len(tip.reach) // PATH_POINTS)][:, [across, up]]
@@ -396,12 +380,3 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
     paths.add_legend()
     caption = "; ".join(f"the {group.nouns} from {group.start} along {group.frame}" for group in groups)
     return {"paths": paths, "reach": draw_over_time(time, panels, capital(f"{caption}, over time."), styles)}
-
-
-def _name_tips(table: BodyTable) -> str:
-    """What the points whose path is drawn are on, as "hands"."""
-    return listed(kinds(table, [(limb.segments or (name,))[-1] for name, limb in table.drawn_limbs.items()]))
-
-
-def _format_duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.1f} min"

@@ -8,9 +8,9 @@ as keyframes, minutes would be tens of megabytes.
 from __future__ import annotations
 
 import base64
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import distribution
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,6 +25,7 @@ from ..body.kinematics import Pose
 from ..body.links import compute_link_placements, find_known_links
 from ..errors import BadData
 from .page import Frame, load_template
+from .words import plain
 
 if TYPE_CHECKING:
     from ..retargeting import Trajectory
@@ -45,16 +46,9 @@ GHOST_OPACITY = 0.35  # of a hand at its target
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
 
 
-class Backdrop(NamedTuple):
-    """Colours behind the body, red, green, blue from 0 to 1."""
-
-    top: tuple[float, float, float]
-    bottom: tuple[float, float, float]
-    grid: tuple[float, float, float]
-
-
-LIGHT = Backdrop((0.985, 0.99, 0.995), (0.89, 0.91, 0.935), (0.70, 0.74, 0.79))
-DARK = Backdrop((0.085, 0.105, 0.130), (0.135, 0.160, 0.190), (0.30, 0.34, 0.39))
+# Colours behind the body, red, green, blue from 0 to 1.
+LIGHT = {"top": (0.985, 0.99, 0.995), "bottom": (0.89, 0.91, 0.935), "grid": (0.70, 0.74, 0.79)}
+DARK = {"top": (0.085, 0.105, 0.130), "bottom": (0.135, 0.160, 0.190), "grid": (0.30, 0.34, 0.39)}
 
 
 class Trail(NamedTuple):
@@ -65,11 +59,11 @@ class Trail(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """The triangles of a link, in its frame."""
+    """The triangles (m, 3) of a link, with their vertices (n, 3) [m] in its frame."""
 
     link: str
-    vertices: np.ndarray  # (n, 3) [m]
-    triangles: np.ndarray  # (m, 3)
+    vertices: np.ndarray
+    triangles: np.ndarray
     rgba: tuple[float, float, float, float]
 
 
@@ -103,15 +97,13 @@ def pose_html(
 
 def _compute_angles(pose: Pose) -> dict[str, np.ndarray]:
     """Joint and angle in words → values (n,) [deg], NaN where an angle is not determined."""
-    try:
-        joints = joint_angles(pose, AUTO).joints
-    except BadData:  # no joint has both of its segments
-        return {}
-    return {
-        f"{joint} {name}".replace("_", " "): np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))
-        for joint, each in joints.items()
-        for k, name in enumerate(each.names)
-    }
+    with contextlib.suppress(BadData):  # no joint has both of its segments
+        return {
+            plain(f"{joint} {name}"): np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))
+            for joint, each in joint_angles(pose, AUTO).joints.items()
+            for k, name in enumerate(each.names)
+        }
+    return {}
 
 
 def _place_body(
@@ -138,12 +130,9 @@ def find_floor(model: BodyModel) -> float:
     if model.table.is_mechanism:
         return 0.0
     lengths = np.array(list(model.lengths.values()))
-    heights = (
-        sum(float(part.by_length[2] @ lengths + part.constant[2]) for part in way.values())
-        for way in model.reaches.values()
-    )
-    lowest = min(heights, default=FLOOR_Z)
-    return lowest if lowest < FEET_Z else FLOOR_Z
+    ways = model.reaches.values()
+    heights = [sum(float(part.by_length[2] @ lengths + part.constant[2]) for part in way.values()) for way in ways]
+    return min(heights, default=FLOOR_Z) if min(heights, default=FLOOR_Z) < FEET_Z else FLOOR_Z
 
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
@@ -158,32 +147,28 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     frames = frame_indices(trajectory.time, fps)
     nearest = np.searchsorted(0.5 * (pose.time[:-1] + pose.time[1:]), trajectory.recorded_time[frames])
     visuals, placed = _place_body(model, pose, nearest)
-    robot = trajectory.robot
-    drawn = build_parts(robot)
+    robot, parts = trajectory.robot, build_parts(trajectory.robot)
     arms = {arm.side: find_person_arm(model.table, arm.side) for arm in robot.arms}
     shoulder_z = float(np.nanmedian([pose.points[arm.points[0]][:, 2] for arm in arms.values()]))
     floor_z = find_floor(model)
-    R_WB, p_WB = place_beside_person(robot, shoulder_z, floor_z)
-    moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
-    ghosts = compute_target_placements(trajectory, frames, R_WB, p_WB)
-    hands = {arm.side: robot.model.frames[arm.hand].parentJoint for arm in robot.arms}
-    colours = {side: choose_trail_colour(arm.tip, model) for side, arm in arms.items()}
-    # Short names: heads are beside them.
-    trails = {side: Trail(pose.points[arm.tip][nearest], colours[side]) for side, arm in arms.items()}
-    trails |= {f"{side}_robot": Trail(trajectory.hand[side][frames] @ R_WB.T + p_WB, colours[side]) for side in arms}
+    root = R_WB, p_WB = place_beside_person(robot, shoulder_z, floor_z)
+    placed |= {f"robot {joint}": at for joint, at in compute_placements(trajectory, parts, frames, *root).items()}
+    meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
+    for side, at in compute_target_placements(trajectory, frames, *root).items():
+        placed[f"target {side}"] = at
+        hand = next(robot.model.frames[arm.hand].parentJoint for arm in robot.arms if arm.side == side)
+        own = [part for part in parts if part.joint == hand]
+        meshes += [Mesh(f"target {side}", p.vertices, p.triangles, (*p.rgba[:3], GHOST_OPACITY)) for p in own]
+    trails = {}  # short names: heads are beside them
+    for side, arm in arms.items():
+        colour = choose_trail_colour(arm.tip, model)
+        trails[side] = Trail(pose.points[arm.tip][nearest], colour)
+        trails[f"{side}_robot"] = Trail(trajectory.hand[side][frames] @ R_WB.T + p_WB, colour)
     return view_html(
         visuals,
         trajectory.time[frames],
-        placed
-        | {f"robot {joint}": at for joint, at in moved.items()}
-        | {f"target {side}": at for side, at in ghosts.items()},
-        meshes=[Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in drawn]
-        + [
-            Mesh(f"target {side}", part.vertices, part.triangles, (*part.rgba[:3], GHOST_OPACITY))
-            for side, joint in hands.items()
-            for part in drawn
-            if part.joint == joint
-        ],
+        placed,
+        meshes=meshes,
         trails=trails,
         phases={"approach": [(0.0, float(trajectory.time[trajectory.approach_samples]))]},
         title=title,
@@ -209,14 +194,11 @@ def view_html(
 
     Parameters
     ----------
-    visuals : the shapes of the body; a link without a placement is not drawn, nor is a visual of kind ``"mesh"``
+    visuals : shapes of the body; a link without a placement is not drawn, nor is a visual of kind ``"mesh"``
     time : (n,) [s], n >= 1, rising
     placements : link → (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]); a link is hidden while its placement is NaN
-    meshes : more shapes of links
-    trails : point → its way
-    angles : name → (n,) [deg], shown beside the body
+    trails, angles : point → its way; name → (n,) [deg], shown beside the body
     phases : name → spans (begin, end) [s]
-    title : plain text; shown, and the name of the window
     floor_z : height [m] of the ground grid in W
     """
     time = np.asarray(time, dtype=float)
@@ -233,15 +215,13 @@ def view_html(
         "offsets": _base64(time - time[0]),  # float32 holds an offset, not seconds since 1970
         "links": links,
         "motion": _base64(motion),
-        "trails": [
-            {"name": name, "colour": trail.colour, "points": _base64(trail.points)} for name, trail in trails.items()
-        ],
+        "trails": [{"name": name, "colour": t.colour, "points": _base64(t.points)} for name, t in trails.items()],
         "angles": [{"name": name, "values": _base64(values)} for name, values in (angles or {}).items()],
         "phases": [
             {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
             for name, spans in (phases or {}).items()
         ],
-        "view": view([*drawn, *map(_box_of, meshes)], links, motion, [trail.points for trail in trails.values()]),
+        "view": view([*drawn, *map(_find_box, meshes)], links, motion, [trail.points for trail in trails.values()]),
         "scene": scene(drawn, links, meshes),
         "backdrop": backdrop(LIGHT, floor_z),
     }
@@ -254,10 +234,9 @@ def filled(template: str, data: Mapping[str, Any], title: str) -> str:
 
 
 def visible(visuals: Iterable[Visual]) -> list[Visual]:
-    """The visuals that can be drawn, in colours that differ."""
+    """The visuals that can be drawn; a dark body (human-gazebo: 0.1 grey) would be a silhouette, and is lightened."""
     drawn = [v for v in visuals if v.kind != "mesh"]
     if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
-        # A body without colours of its own (human-gazebo: 0.1 grey) would be a silhouette.
         rgba = [(0.4 + 0.6 * r, 0.4 + 0.6 * g, 0.4 + 0.6 * b, opacity) for r, g, b, opacity in (v.rgba for v in drawn)]
         drawn = [v._replace(rgba=own) for v, own in zip(drawn, rgba, strict=True)]
     return drawn
@@ -279,10 +258,10 @@ def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] 
             {
                 "link": links.index(visual.link),
                 "kind": visual.kind,
-                "size": [float(length) for length in visual.size],
-                "quat": [float(value) for value in visual.quat_LV],
-                "position": [float(value) for value in visual.p_LV],
-                "rgba": [float(value) for value in visual.rgba],
+                "size": list(map(float, visual.size)),
+                "quat": visual.quat_LV.tolist(),
+                "position": visual.p_LV.tolist(),
+                "rgba": list(map(float, visual.rgba)),
             }
             for visual in drawn
         ],
@@ -290,58 +269,51 @@ def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] 
             {
                 "link": links.index(mesh.link),
                 "vertices": _base64(mesh.vertices),
-                "triangles": base64.b64encode(np.ascontiguousarray(mesh.triangles, "<u4").tobytes()).decode("ascii"),
-                "rgba": [float(value) for value in mesh.rgba],
+                "triangles": _base64(mesh.triangles, "<u4"),
+                "rgba": list(map(float, mesh.rgba)),
             }
             for mesh in meshes
         ],
     }
 
 
-def backdrop(colours: Backdrop, floor_z: float = FLOOR_Z) -> dict[str, Any]:
+def backdrop(colours: Mapping[str, tuple[float, float, float]], floor_z: float = FLOOR_Z) -> dict[str, Any]:
     """Background and ground grid as static/viewer.js builds them."""
-    return {**colours._asdict(), "floor": floor_z}
+    return {**colours, "floor": floor_z}
 
 
-def _box_of(mesh: Mesh) -> Visual:
+def _find_box(mesh: Mesh) -> Visual:
     """The box around a mesh, for the camera."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2] - low[2]))
-    return Visual(mesh.link, "box", size, np.array([0.0, 0.0, 0.0, 1.0]), 0.5 * (low + high), mesh.rgba)
+    return Visual(mesh.link, "box", tuple(high - low), np.array([0.0, 0.0, 0.0, 1.0]), 0.5 * (low + high), mesh.rgba)
 
 
 def view(
     visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]
 ) -> dict[str, Any]:
-    """What the camera shows: the direction from which it looks at first, and the motion's outermost points [m] in W."""
+    """What the camera shows: the direction from which it looks at first, and the motion's outermost points [m] in W.
+
+    A visual counts as the ball around it.
+    """
     k = np.arange(DIRECTIONS) + 0.5  # evenly over the sphere
     height, angle = 1.0 - 2.0 * k / DIRECTIONS, k * np.pi * (1.0 + 5.0**0.5)
-    directions = np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1.0 - height**2)
-    directions = np.vstack([directions, height])
-
-    def find_outermost(points_W: np.ndarray) -> np.ndarray:
-        points_W = points_W[np.isfinite(points_W).all(axis=1)]
-        return points_W[np.unique(np.argmax(points_W @ directions, axis=0))] if len(points_W) else points_W
-
-    points_W = [np.zeros((1, 3)), *(trail[:: max(1, len(trail) // (4 * MOST_POSES))] for trail in trails)]
-    for link, placed in zip(links, motion[:, :: max(1, motion.shape[1] // MOST_POSES)].astype(float), strict=True):
+    directions = np.vstack([np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1.0 - height**2), height])
+    directions = np.hstack([directions, np.eye(3), -np.eye(3)])
+    balls_W = [(np.zeros((1, 3)), 0.0), *((trail[:: max(1, len(trail) // (4 * MOST_POSES))], 0.0) for trail in trails)]
+    for visual in visuals:
+        placed = motion[links.index(visual.link), :: max(1, motion.shape[1] // MOST_POSES)].astype(float)
         placed = placed[np.isfinite(placed).all(axis=1)]
-        corners_L = [_corners(visual) for visual in visuals if visual.link == link]
+        half = np.array(visual.size) * {"box": 0.5, "cylinder": (1.0, 0.5), "sphere": 1.0}[visual.kind]
         if len(placed):
-            R_WL = Rotation.from_quat(placed[:, :4]).as_matrix()
-            corners_W = np.concatenate(corners_L) @ R_WL.swapaxes(1, 2) + placed[:, None, 4:]
-            points_W.append(find_outermost(corners_W.reshape(-1, 3)))
-    return {"toward": CAMERA_FROM, "points": np.round(find_outermost(np.concatenate(points_W)), 4).tolist()}
-
-
-def _corners(visual: Visual) -> np.ndarray:
-    """(8, 3) [m] of the box around a visual, in its link."""
-    radius = visual.size[0]
-    half_edges = np.array([radius, radius, visual.size[1] / 2.0 if visual.kind == "cylinder" else radius])
-    if visual.kind == "box":
-        half_edges = np.array(visual.size) / 2.0
-    corners_V = np.array(list(product((-1.0, 1.0), repeat=3))) * half_edges
-    return Rotation.from_quat(visual.quat_LV).apply(corners_V) + visual.p_LV
+            centre_W = Rotation.from_quat(placed[:, :4]).apply(visual.p_LV) + placed[:, 4:]
+            balls_W.append((centre_W, float(np.linalg.norm(half))))
+    centres_W = np.concatenate([centres for centres, _ in balls_W])
+    radii = np.concatenate([np.full(len(centres), radius) for centres, radius in balls_W])
+    known = np.isfinite(centres_W).all(axis=1)
+    centres_W, radii = centres_W[known], radii[known]
+    outermost = np.argmax(centres_W @ directions + radii[:, None], axis=0)
+    points_W = centres_W[outermost] + radii[outermost, None] * directions.T
+    return {"toward": CAMERA_FROM, "points": np.round(points_W, 4).tolist()}
 
 
 def choose_trail_colour(point: str, model: BodyModel) -> str:
@@ -356,5 +328,5 @@ def _meshcat_source() -> Markup:
     return Markup(source.replace("</script", "<\\/script").replace("<!--", "<\\!--"))
 
 
-def _base64(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
+def _base64(values: np.ndarray, dtype: str = "<f4") -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode("ascii")

@@ -61,6 +61,11 @@ def number(value: float, digits: int = 1, unit: str = "", sign: str = "", unknow
     return f"{rounded:{sign if rounded else ''}.{digits}f}".replace("-", "−") + unit
 
 
+def spread(std: float, digits: int = 1, unit: str = "") -> str:
+    """A standard deviation with its sign and unit."""
+    return f"± {std:.{digits}f}{unit}" if np.isfinite(std) else "not known"
+
+
 def plus_minus(value: float, std: float, unit: str = "", digits: int = 1) -> str:
     """A number with its standard deviation, where it is known, and its unit."""
     known = f" ± {std:.{digits}f}" if np.isfinite(value) and np.isfinite(std) else ""
