@@ -22,7 +22,9 @@ Arms = Literal["left", "right", "both"]
 
 
 def _read_whole_number(_kind: type, tokens: Sequence[Token]) -> int:
-    return int(tokens[0].value)  # cyclopts would round
+    if not tokens[0].value.lstrip("-").isdecimal():  # cyclopts would round it
+        raise ValueError(f"'{tokens[0].value}' is not a whole number")
+    return int(tokens[0].value)
 
 
 # Validators: rooms load when an option is given ----------------------------------------------------------------------
