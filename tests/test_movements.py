@@ -22,9 +22,10 @@ from wepose_pin.angles.joints import JOINTS, describe_joint
 from wepose_pin.angles.movement import (
     MovementOptions,
     analyze_movement,
+    build_comparison_table,
+    compute_interval,
     smooth_pose,
 )
-from wepose_pin.angles.movement_tables import build_comparison_table, compute_interval
 from wepose_pin.angles.tables import compute_summary_std, summarize_joint
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import Pose, compute_pose
@@ -257,7 +258,6 @@ def test_where_nothing_repeats_there_are_phases_all_the_same(
         ("--main-angle elbow", "--main-angle elbow: no such angle in the result"),
         ("--repetitions bent", "--repetitions bent: the recording has no such phase; did you mean 'bend'"),
         ("--repetitions bend --main-angle right_elbow_flexion", "and --repetitions bend marks them"),
-        ("--repetitions bend --cycles", "--cycles: finds repetitions, and --repetitions bend marks them"),
         ("--interval 5 99", "--interval 5 99: the recording runs from 0 to 14 s"),
         ("--phase bend", "--phase bend: bend has 3 intervals"),
         ("--shoulder XYZ", 'Invalid value "XYZ" for --shoulder'),

@@ -46,7 +46,7 @@ class Angles3(NamedTuple):
 
 
 def sequence(name: str) -> Sequence:
-    """Of three letters X, Y, Z, neighbours different."""
+    """Read a sequence of three letters X, Y, Z, neighbours different."""
     i, j, last = ("XYZ".index(letter) for letter in name)
     k = 3 - i - j
     eps = 1.0 if (i + 1) % 3 == j else -1.0
@@ -54,7 +54,7 @@ def sequence(name: str) -> Sequence:
 
 
 def decompose(quat: np.ndarray, name: str) -> Angles3:
-    """The angles of rotations (n, 4): first and third in (−π, π], second in [−π, 0] or, of three axes, [−π/2, π/2].
+    """Take rotations (n, 4) apart: first and third in (−π, π], second in [−π, 0] or, of three axes, [−π/2, π/2].
 
     A proper sequence's second angle is negative, as the ISB has the elevation of the arm. In the lock, where only the
     sum or the difference of first and third is defined, the first is held from the sample before (at the beginning,
@@ -71,21 +71,14 @@ def decompose(quat: np.ndarray, name: str) -> Angles3:
     first, third = half_sum + half_difference, half_sum - half_difference
     free = np.minimum(cosine, sine) < _LOCKED
     if free.any():
-        first = _fill_free(first, free)
+        known = np.flatnonzero(~free)
+        source = np.searchsorted(known, np.arange(len(first)), side="right") - 1
+        first = first[known[np.maximum(source, 0)]] if len(known) else np.zeros_like(first)
         third = np.where(free, np.where(sine < cosine, 2.0 * half_sum - first, first - 2.0 * half_difference), third)
     if not s.offset or s.eps > 0.0:  # the other of the two solutions is the one in the principal range
         first, tip, third = first + np.pi, -tip, third + np.pi
     gimbal = 2.0 * np.arctan2(np.minimum(cosine, sine), np.maximum(cosine, sine))
     return Angles3(np.column_stack([wrap(first), tip + s.offset, wrap(third)]), gimbal)
-
-
-def _fill_free(first: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """`first` (n,) with its `free` samples from the last sample that is not free, or from the next, or zero."""
-    known = np.flatnonzero(~free)
-    if not len(known):
-        return np.zeros_like(first)
-    source = np.searchsorted(known, np.arange(len(first)), side="right") - 1
-    return first[known[np.maximum(source, 0)]]
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
@@ -94,12 +87,12 @@ def wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def round_to_turns(angle: ArrayLike) -> np.ndarray:
-    """The nearest multiples of 2π."""
+    """Round to the nearest multiples of 2π."""
     return np.asarray(2.0 * np.pi * np.round(np.asarray(angle) / (2.0 * np.pi)))
 
 
 def count_turns(angles: np.ndarray) -> np.ndarray:
-    """The full turns [rad] by which angles (s, …) are off the first that is known, and this one off zero.
+    """Count the full turns [rad] by which angles (s, …) are off the first that is known, and this one off zero.
 
     Angles are continuous in time: a motion about the lock may return to a posture a full turn later.
     """
@@ -109,7 +102,7 @@ def count_turns(angles: np.ndarray) -> np.ndarray:
 
 
 def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
-    """The angles (n, 3) over time, unwrapped: of the two solutions of each sample the one that continues the last.
+    """Follow the angles (n, 3) over time, unwrapped: of both solutions of a sample the one that continues the last.
 
     A motion that goes straight through the lock keeps its first and third angle, and the second goes on beyond its
     principal range. What the motion does within `near_lock` [rad] of the lock does not count, only how it came and how
@@ -170,9 +163,7 @@ def _stay_near(principal: np.ndarray, edge: np.ndarray, s: Sequence) -> np.ndarr
     nearer = np.cos(principal[:, :1] - edge[:, :1]) >= 0.0
     values = np.where(nearer, principal, other)
     values[:, :2] -= round_to_turns(values[:, :2] - (edge[:, :2] if known else (0.0, s.offset)))
-    sign = np.where(
-        np.cos(values[:, 1] - s.offset) > 0.0, 1.0, -1.0
-    )  # the sum of both is determined, or the difference
+    sign = np.where(np.cos(values[:, 1] - s.offset) > 0.0, 1.0, -1.0)  # the sum is determined, or the difference
     total = values[:, 2] + sign * values[:, 0]
     before = edge[:, 2] + sign[:1] * edge[:, 0] if known else total[:1] - round_to_turns(total[:1])
     values[:, 2] = np.unwrap(np.concatenate([before, total]))[1:] - sign * values[:, 0]
@@ -180,7 +171,7 @@ def _stay_near(principal: np.ndarray, edge: np.ndarray, s: Sequence) -> np.ndarr
 
 
 def gradients(values: np.ndarray, name: str) -> np.ndarray:
-    """Derivatives of the angles (n, 3) by a small rotation on the left: rows (n, 3, 3).
+    """Compute derivatives of the angles (n, 3) by a small rotation on the left: rows (n, 3, 3).
 
     In axes turned by the first angle the turn is ``ȧ e_i + ḃ e_j + ċ (cos(tip) e_i − ε sin(tip) e_k)``; this solved
     for the rates. The first and the third row grow with 1/sin(tip), without bound at the lock.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import polars as pl
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
@@ -64,20 +63,13 @@ AUTO = "auto"  # the sequence of `choose_shoulder_sequence`
 
 
 class Joint(NamedTuple):
-    """A joint's two segments and its angles.
-
-    Parameters
-    ----------
-    sequence : empty for the shoulder's choice
-    angles : name → where it is positive
-    axes : where X, Y, Z of both segments point in our frame of them; None: as `ISB_AXES` has them
-    """
+    """A joint's two segments and its angles."""
 
     proximal: str
     distal: str
-    sequence: str
-    angles: Mapping[str, str]
-    axes: tuple[str, str, str] | None = None
+    sequence: str  # empty for the shoulder's choice
+    angles: Mapping[str, str]  # name → where it is positive
+    axes: tuple[str, str, str] | None = None  # X, Y, Z of both segments in our frame of them; None: `ISB_AXES`
 
 
 _ELBOW = {  # Wu 2005, 3.4.1
@@ -117,33 +109,21 @@ _PELVIS = {
 }
 
 
-def _arm(side: str) -> dict[str, Joint]:
-    upper_arm, forearm, hand = f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"
-    return {
-        f"{side}_shoulder": Joint("torso", upper_arm, "", {}),
-        f"{side}_elbow": Joint(upper_arm, forearm, "ZXY", _ELBOW),
-        f"{side}_wrist": Joint(forearm, hand, "ZXY", _WRIST),
+JOINTS = {"thorax": Joint("world", "torso", "ZXY", _THORAX)}
+for _side in ("left", "right"):
+    JOINTS |= {
+        f"{_side}_shoulder": Joint("torso", f"{_side}_upper_arm", "", {}),
+        f"{_side}_elbow": Joint(f"{_side}_upper_arm", f"{_side}_forearm", "ZXY", _ELBOW),
+        f"{_side}_wrist": Joint(f"{_side}_forearm", f"{_side}_hand", "ZXY", _WRIST),
     }
-
-
-def _leg(side: str) -> dict[str, Joint]:
-    thigh, shank, foot = f"{side}_thigh", f"{side}_shank", f"{side}_foot"
-    return {
-        f"{side}_hip": Joint("pelvis", thigh, "ZXY", _HIP),
-        f"{side}_knee": Joint(thigh, shank, "ZXY", _KNEE, KNEE_AXES),
-        f"{side}_ankle": Joint(shank, foot, "ZXY", _ANKLE),
+# In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
+JOINTS["pelvis_in_world"] = Joint("world", "pelvis", "ZXY", _PELVIS)
+for _side in ("left", "right"):
+    JOINTS |= {
+        f"{_side}_hip": Joint("pelvis", f"{_side}_thigh", "ZXY", _HIP),
+        f"{_side}_knee": Joint(f"{_side}_thigh", f"{_side}_shank", "ZXY", _KNEE, KNEE_AXES),
+        f"{_side}_ankle": Joint(f"{_side}_shank", f"{_side}_foot", "ZXY", _ANKLE),
     }
-
-
-JOINTS = {
-    "thorax": Joint("world", "torso", "ZXY", _THORAX),
-    **_arm("left"),
-    **_arm("right"),
-    # In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
-    "pelvis_in_world": Joint("world", "pelvis", "ZXY", _PELVIS),
-    **_leg("left"),
-    **_leg("right"),
-}
 _WORDS = {"torso": "thorax", "world": "W"}
 
 
@@ -151,28 +131,19 @@ _WORDS = {"torso": "thorax", "world": "W"}
 class JointAngles:
     """The angles of one joint over time.
 
-    Parameters
-    ----------
-    sequence : intrinsic axes, such as "ZXY"
-    names : of the three angles
-    values : (n, 3) [rad], continuous but for what is near the lock; NaN where the pose has none
-    gimbal : (n,) [rad], how far from gimbal lock, at most π/2
-    near_lock : (n,) bool, within 10° of the lock: first and third angle say little there, and jump by full turns
-    gap : (n,) bool, one of the segments was bridged over a gap of its sensor, or is not known
-    std : (n, 3) [rad], one standard deviation, at most that of an angle even over the circle (104°); None where the
-        pose has no covariances
-    quat : (n, 4) xyzw, the rotation that the angles are of: the distal segment in the proximal one, both in the
-        ISB's axes (a knee: in `KNEE_AXES`), a left joint mirrored on the sagittal plane as its angles are
+    `std` is at most that of an angle even over the circle (104°). `quat` is the rotation that the angles are of: the
+    distal segment in the proximal one, both in the ISB's axes (a knee: in `KNEE_AXES`), a left joint mirrored on the
+    sagittal plane as its angles are.
     """
 
-    sequence: str
-    names: tuple[str, ...]
-    values: np.ndarray
-    gimbal: np.ndarray
-    near_lock: np.ndarray
-    gap: np.ndarray
-    std: np.ndarray | None
-    quat: np.ndarray
+    sequence: str  # intrinsic axes, such as "ZXY"
+    names: tuple[str, ...]  # of the three angles
+    values: np.ndarray  # (n, 3) [rad], continuous but for what is near the lock; NaN where the pose has none
+    gimbal: np.ndarray  # (n,) [rad], how far from gimbal lock, at most π/2
+    near_lock: np.ndarray  # (n,) bool, within 10° of the lock, where first and third angle say little and jump
+    gap: np.ndarray  # (n,) bool, one of the segments was bridged over a gap of its sensor, or is not known
+    std: np.ndarray | None  # (n, 3) [rad], one standard deviation; None where the pose has no covariances
+    quat: np.ndarray  # (n, 4) xyzw
 
     def __getitem__(self, angle: str) -> np.ndarray:
         """(n,) [rad], the values of the angle of this name."""
@@ -193,16 +164,10 @@ class JointAngles:
 
 @dataclass(frozen=True)
 class Angles:
-    """The angles of all joints whose segments are known: ``angles[joint][angle]`` is (n,) [rad].
+    """The angles of all joints whose segments are known: ``angles[joint][angle]`` is (n,) [rad]."""
 
-    Parameters
-    ----------
-    time : (n,) [s]
-    joints : name → `JointAngles`, with the three angles and their standard deviations
-    """
-
-    time: np.ndarray
-    joints: Mapping[str, JointAngles]
+    time: np.ndarray  # (n,) [s]
+    joints: Mapping[str, JointAngles]  # name → its three angles and their standard deviations
 
     def __getitem__(self, joint: str) -> JointAngles:
         """The angles of the joint of this name."""
@@ -213,23 +178,12 @@ class Angles:
     def __iter__(self) -> Iterator[str]:
         return iter(self.joints)
 
-    def _repr_html_(self) -> str:
-        """The range of each angle in degrees, a row an angle."""
-        rows = [
-            {"joint": name, "angle": angle, "lowest_deg": lowest, "highest_deg": highest}
-            for name, joint in self.joints.items()
-            for angle, lowest, highest in zip(
-                joint.names, *np.degrees(np.nanquantile(joint.values, (0.0, 1.0), axis=0)), strict=True
-            )
-        ]
-        return pl.DataFrame(rows)._repr_html_()
-
     def __repr__(self) -> str:
         return f"Angles({', '.join(self.joints)}: {len(self.time)} samples)"
 
 
 def diagnose_lock(angles: Angles) -> list[Diagnostic]:
-    """The joints that are near gimbal lock for more than `MAX_NEAR_LOCK` of the samples."""
+    """Diagnose joints that are near gimbal lock for more than `MAX_NEAR_LOCK` of the samples."""
     diagnostics = []
     for name, joint in angles.joints.items():
         share = float(np.mean(joint.near_lock))
@@ -348,21 +302,13 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
-    gimbal = _expand(known, angles.gimbal)
-    return JointAngles(
-        joint.sequence,
-        tuple(joint.angles),
-        _expand(known, values),
-        gimbal,
-        gimbal < NEAR_LOCK,
-        gap,
-        None if std is None else _expand(known, std),
-        _expand(known, rotations.unwrap_signs(quat)),
-    )
+    gimbal, values, quat = (_expand(known, each) for each in (angles.gimbal, values, rotations.unwrap_signs(quat)))
+    std = None if std is None else _expand(known, std)
+    return JointAngles(joint.sequence, tuple(joint.angles), values, gimbal, gimbal < NEAR_LOCK, gap, std, quat)
 
 
 def compute_gradients(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:
-    """Derivatives (m, 3, 3) of a joint's angles at samples (m,) by a small rotation in W of its distal segment.
+    """Compute derivatives (m, 3, 3) of a joint's angles at samples (m,) by a small rotation in W of its distal segment.
 
     Those by the proximal segment are of opposite sign. The samples are known ones.
     """
@@ -380,10 +326,7 @@ def _gradients(values: np.ndarray, sequence: str, quat_WP: np.ndarray, left: boo
 
 
 def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, samples: np.ndarray) -> np.ndarray:
-    """The axes in W in which a joint's angles are taken, of one of its segments, at m samples: (m, 4).
-
-    Of a left joint mirrored.
-    """
+    """Axes (m, 4) in W in which a joint's angles are taken, of one segment at m samples; of a left joint mirrored."""
     axes = joint.axes or ISB_AXES[segment.removeprefix("left_").removeprefix("right_")]
     quat_LI = Rotation.from_matrix(np.column_stack([AXES[axis] for axis in axes])).as_quat()
     if segment == "world":

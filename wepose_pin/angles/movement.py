@@ -1,12 +1,17 @@
-"""A session's angles for a paper: its repetitions, and what each angle comes to in them."""
+"""A session's angles for a paper: its repetitions, what each angle comes to in them, and the tables of it.
+
+A table has a row an angle, in degrees; what is not determined is NaN.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import polars as pl
+from scipy.special import stdtrit
 
 from ..body.kinematics import Pose, find_samples
 from ..errors import WrongOption, one_of
@@ -14,12 +19,16 @@ from ..filters.butterworth import low_pass
 from ..recording import Intervals
 from ..recording.gaps import find_runs
 from ..rotations import unwrap_signs
-from .curves import MeanCurve, compute_mean_curves
 from .euler import count_turns
-from .joints import AUTO, JOINTS, Angles, joint_angles
-from .repetitions import Repetitions, find_repetitions
-from .tables import compute_summary_std, summarize_joint
+from .joints import AUTO, JOINTS, SHOULDER_SEQUENCES, Angles, describe_joint, group_sides, joint_angles
+from .repetitions import PERCENT, MeanCurve, Repetitions, compute_mean_curves, find_repetitions
+from .tables import angle_table, compute_summary_std, summarize_joint
 
+SOURCE = (
+    "Wu et al. 2005 (J Biomech 38:981-992) for thorax, shoulder, elbow and wrist, "
+    "Wu et al. 2002 (J Biomech 35:543-548) for pelvis, hip and ankle, "
+    "Grood and Suntay 1983 (J Biomech Eng 105:136-144) for the knee"
+)
 MEASURES = {"lowest": "deg", "highest": "deg", "range": "deg", "peak_rate": "deg_s"}  # units in a file
 # A longer time step than this many usual ones ends a run: the samples on its two sides are filtered apart.
 _LONGEST_STEP = 1.5
@@ -28,48 +37,27 @@ _SHORTEST_RUN = 10  # samples; a shorter run is not filtered
 
 @dataclass(frozen=True)
 class MovementOptions:
-    """How the angles of a session are made and its repetitions found.
+    """How the angles of a session are made and its repetitions found."""
 
-    Parameters
-    ----------
-    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`, or `AUTO`
-    cutoff_hz : of the low-pass (`smooth_pose`); None: none
-    phase : takes each of its intervals as a repetition; None: repetitions are found
-    main_angle, rising, cycles : of `find_repetitions`
-    """
-
-    sequence: str = AUTO
-    cutoff_hz: float | None = None
-    phase: str | None = None
-    main_angle: str | None = None
+    sequence: str = AUTO  # of the shoulder, one of `SHOULDER_SEQUENCES`, or `AUTO`
+    cutoff_hz: float | None = None  # of the low-pass (`smooth_pose`); None: none
+    phase: str | None = None  # takes each of its intervals as a repetition; None: repetitions are found
+    main_angle: str | None = None  # these two: of `find_repetitions`
     rising: bool | None = None
-    cycles: bool = False
 
 
 @dataclass(frozen=True)
 class Movement:
-    """The angles of a session, or of the selected time of it.
+    """The angles of a session, or of the selected time of it."""
 
-    Parameters
-    ----------
-    name : of the session
-    pose : low-passed as the angles are
-    angles : of the pose
-    phases : of the recording, as far as they lie in the time of the pose
-    repetitions : found, or marked by a phase
-    measures : of the repetitions, as `measure_spans` has them
-    curves : joint → its three mean curves; empty without repetitions
-    cutoff_hz : of the low-pass; None: there is none
-    """
-
-    name: str
-    pose: Pose
+    name: str  # of the session
+    pose: Pose  # low-passed as the angles are
     angles: Angles
-    phases: Mapping[str, Intervals]
-    repetitions: Repetitions
-    measures: pl.DataFrame
-    curves: Mapping[str, tuple[MeanCurve, MeanCurve, MeanCurve]]
-    cutoff_hz: float | None
+    phases: Mapping[str, Intervals]  # of the recording, as far as they lie in the time of the pose
+    repetitions: Repetitions  # found, or marked by a phase
+    measures: pl.DataFrame  # of the repetitions, as `measure_spans` has them
+    curves: Mapping[str, tuple[MeanCurve, ...]]  # joint → its three mean curves; empty without repetitions
+    cutoff_hz: float | None  # of the low-pass; None: there is none
 
     @property
     def sequence(self) -> str:
@@ -99,7 +87,7 @@ def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], opt
     inside = {phase: spans for phase, spans in lying.items() if spans}
     marked = options.phase
     if marked is None:
-        repetitions = find_repetitions(angles, options.main_angle, options.rising, options.cycles)
+        repetitions = find_repetitions(angles, options.main_angle, options.rising)
     elif phases.get(marked):
         reason = "" if marked in inside else f"no interval of the phase {marked} lies in the selected time"
         spans = np.array(inside.get(marked, ()), dtype=float).reshape(-1, 2)
@@ -166,3 +154,160 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
                     row |= {f"{measure}_{unit}": value[k, m], f"{measure}_std_{unit}": std[k, m]}
                 rows.append({**row, "near_lock": each.near_lock, "gap": each.gap})
     return pl.DataFrame(rows).sort("span", "order", maintain_order=True).drop("order") if rows else pl.DataFrame()
+
+
+# Tables ------------------------------------------------------------------------------------------------------------
+
+
+def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Say what each angle is: sequence, axis, where it is positive, and the source; left and right alike."""
+    rows: dict[tuple[str, ...], None] = {}
+    for movement in movements:
+        for group, members in group_sides(movement.angles.joints).items():
+            name = next(iter(members.values()))
+            joint, rotation = movement.angles[name], describe_joint(name)
+            positive = JOINTS[name].angles or SHOULDER_SEQUENCES[joint.sequence]
+            for axis, angle in zip(joint.sequence, joint.names, strict=True):
+                rows[group, rotation, joint.sequence, axis, angle, positive[angle], SOURCE] = None
+    names = ["joint", "rotation", "sequence", "axis", "angle", "positive", "source"]
+    return pl.DataFrame(list(rows), schema=names, orient="row")
+
+
+def build_angle_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Build a row a sample of each session: its angles as `angle_table` has them."""
+    tables = [angle_table(each.angles).select(pl.lit(each.name).alias("session"), pl.all()) for each in movements]
+    return pl.concat(tables, how="diagonal")
+
+
+def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Build a row a session: its time, how repetitions were found, their number and duration."""
+    rows = []
+    for movement in movements:
+        time, repetitions = movement.angles.time, movement.repetitions
+        seconds = np.diff(repetitions.spans, axis=1)
+        rows.append(
+            {
+                "session": movement.name,
+                "from_s": float(time[0]),
+                "to_s": float(time[-1]),
+                "low_pass_hz": movement.cutoff_hz,
+                "repetitions_by": repetitions.source,
+                "first": {None: "", True: "rising", False: "falling"}[repetitions.rising],
+                "n": len(repetitions.spans),
+                "duration_mean_s": float(seconds.mean()) if len(seconds) else float("nan"),
+                "duration_sd_s": float(seconds.std(ddof=1)) if len(seconds) > 1 else float("nan"),
+                "cmc": repetitions.cmc,
+                "left_out": repetitions.left_out,
+                "why_none": repetitions.reason,
+            }
+        )
+    return pl.DataFrame(rows, schema_overrides={"low_pass_hz": pl.Float64})
+
+
+def build_phase_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Build a row an angle in all of the selected time, and in each interval of a phase that lies in it."""
+    tables = []
+    for movement in movements:
+        time = movement.angles.time
+        parts = [("all", 1, (float(time[0]), float(time[-1])))]
+        parts += [(name, k, span) for name, spans in movement.phases.items() for k, span in enumerate(spans, 1)]
+        about = [
+            {"session": movement.name, "phase": name, "number": k, "from_s": begin, "to_s": end}
+            for name, k, (begin, end) in parts
+        ]
+        tables.append(_join(about, measure_spans(movement.pose, movement.angles, [span for _, _, span in parts])))
+    return pl.concat(tables)
+
+
+def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Build a row an angle in each repetition."""
+    tables = []
+    for movement in (movement for movement in movements if len(movement.measures)):
+        about = [
+            {"session": movement.name, "repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
+            for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
+        ]
+        tables.append(_join(about, movement.measures))
+    return pl.concat(tables) if tables else pl.DataFrame()
+
+
+def _join(about: Sequence[Mapping[str, Any]], measures: pl.DataFrame) -> pl.DataFrame:
+    """Put what is known of each span before its measures."""
+    spans = pl.DataFrame(about).with_row_index("span").cast({"span": pl.Int64})
+    return spans.join(measures, on="span", maintain_order="left_right").drop("span")
+
+
+def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Build a row an angle of each session: mean and deviation over repetitions, what is stated, and the CMC."""
+    repetitions = build_repetition_table(movements)
+    if not len(repetitions):
+        return pl.DataFrame()
+    columns = [pl.len().alias("repetitions")]
+    for measure, unit in MEASURES.items():
+        value = pl.col(f"{measure}_{unit}").fill_nan(None)
+        std = pl.col(f"{measure}_std_{unit}").fill_nan(None).filter(value.is_not_null())
+        columns.append(value.count().alias(f"{measure}_n"))
+        columns += [value.mean().alias(f"{measure}_mean_{unit}"), value.std().alias(f"{measure}_sd_{unit}")]
+        columns.append(std.pow(2).mean().sqrt().alias(f"{measure}_std_{unit}"))
+    names = ("session", "joint", "angle", "sequence")
+    cmc = [
+        {"session": movement.name, "joint": joint, "angle": angle, "cmc": curve.cmc}
+        for movement in movements
+        for joint, curves in movement.curves.items()
+        for angle, curve in zip(movement.angles[joint].names, curves, strict=True)
+    ]
+    table = repetitions.group_by(*names, maintain_order=True).agg(columns).fill_null(float("nan"))
+    return table.join(pl.DataFrame(cmc), on=names[:3], maintain_order="left")
+
+
+def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Build a row a percent of the repetition of each angle and session."""
+    tables = []
+    for movement in movements:
+        for name, curves in movement.curves.items():
+            for angle, curve in zip(movement.angles[name].names, curves, strict=True):
+                about = {"session": movement.name, "joint": name, "angle": angle}
+                degrees = {f"{part}_deg": np.degrees(getattr(curve, part)) for part in ("mean", "sd", "std")}
+                table = pl.DataFrame({"percent": PERCENT, "n": curve.n} | degrees)
+                tables.append(table.select(*(pl.lit(text).alias(key) for key, text in about.items()), pl.all()))
+    return pl.concat(tables) if tables else pl.DataFrame()
+
+
+def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Compare each further session with the first, a row a measure of each angle that both have."""
+    summary = build_summary_table(movements)
+    sessions = summary["session"].unique(maintain_order=True).to_list() if len(summary) else []
+    rows: list[dict[str, Any]] = []
+    for session in sessions[1:]:
+        against, further = (summary.filter(pl.col("session") == each) for each in (sessions[0], session))
+        for row in against.join(further, on=("joint", "angle"), maintain_order="left").iter_rows(named=True):
+            # Angles of a session may be a full turn on.
+            shift = sum(row[f"{end}_mean_deg_right"] - row[f"{end}_mean_deg"] for end in ("lowest", "highest"))
+            turns = float(np.nan_to_num(360.0 * np.round(0.5 * shift / 360.0)))
+            about = {"session": session, "against": sessions[0], "joint": row["joint"], "angle": row["angle"]}
+            for measure, unit in MEASURES.items():
+                parts = ("n", f"mean_{unit}", f"sd_{unit}", f"std_{unit}")
+                n, mean, sd, std = ([row[f"{measure}_{part}{end}"] for end in ("", "_right")] for part in parts)
+                mean[1] -= turns if measure in ("lowest", "highest") else 0.0
+                low, high = compute_interval((n[0], mean[0], sd[0]), (n[1], mean[1], sd[1]))
+                figures = {"first_n": n[0], "n": n[1], "first_mean": mean[0], "first_sd": sd[0], "mean": mean[1]}
+                figures |= {"sd": sd[1], "difference": mean[1] - mean[0], "ci95_low": low, "ci95_high": high}
+                figures["difference_std"] = float(np.hypot(*std))
+                rows.append({**about, "measure": measure, "unit": unit.replace("_", "/"), **figures})
+    return pl.DataFrame(rows)
+
+
+def compute_interval(first: tuple[int, float, float], second: tuple[int, float, float]) -> tuple[float, float]:
+    """Compute the 95 % interval (Welch 1947) of a difference of means, by n, mean and standard deviation of each.
+
+    It is from the spread of the values alone; NaN where there are fewer than two of either.
+    """
+    value = second[1] - first[1]
+    if min(first[0], second[0]) < 2:
+        return float("nan"), float("nan")
+    a, b = first[2] ** 2 / first[0], second[2] ** 2 / second[0]
+    half = 0.0
+    if a + b > 0.0:
+        freedom = (a + b) ** 2 / (a**2 / (first[0] - 1) + b**2 / (second[0] - 1))
+        half = float(stdtrit(freedom, 0.975) * np.sqrt(a + b))
+    return value - half, value + half

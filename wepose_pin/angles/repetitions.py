@@ -1,4 +1,4 @@
-"""The repetitions of a movement: excursions of one angle, from a low posture over a peak and back."""
+"""The repetitions of a movement, excursions of one angle out and back, and their time-normalised curves, 0 to 100 %."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
 from ..recording.gaps import find_runs
-from .curves import compute_cmc, normalize_time
+from .euler import count_turns
 from .joints import JOINTS, MAX_NEAR_LOCK, Angles
 
+POINTS = 101  # 0, 1, … 100 %
+PERCENT = np.linspace(0.0, 100.0, POINTS)
 # Found on the angle below this frequency [Hz]; voluntary motion of limbs is slower (Winter 2009, 2.2.3).
 CUTOFF_HZ = 5.0
 MIN_RANGE = np.radians(10.0)  # of the angle; what is smaller is sway, or noise
@@ -41,24 +43,14 @@ MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not 
 
 
 class Repetitions(NamedTuple):
-    """Repetitions of a movement.
+    """Repetitions of a movement."""
 
-    Parameters
-    ----------
-    spans : (r, 2) [s], begin and end
-    source : the angle they were found by, as ``right_elbow_flexion``, or the phase that marks them; empty: no angle
-    rising : the angle grows first; None where a phase marks them
-    cmc : of the curves of that angle; NaN where a phase marks them
-    left_out : excursions of the angle that are unlike the others, or in gaps
-    reason : why there are none; empty where there are some
-    """
-
-    spans: np.ndarray
-    source: str
-    rising: bool | None = None
-    cmc: float = float("nan")
-    left_out: int = 0
-    reason: str = ""
+    spans: np.ndarray  # (r, 2) [s], begin and end
+    source: str  # the angle they were found by, as ``right_elbow_flexion``, or the phase that marks them; empty: none
+    rising: bool | None = None  # the angle grows first; None where a phase marks them
+    cmc: float = float("nan")  # of the curves of that angle; NaN where a phase marks them
+    left_out: int = 0  # excursions of the angle that are unlike the others, or in gaps
+    reason: str = ""  # why there are none; empty where there are some
 
 
 def list_angles(angles: Angles) -> dict[str, tuple[str, int]]:
@@ -84,9 +76,7 @@ def find_main_angle(angles: Angles) -> str | None:
     return max(ranges, key=lambda angle: ranges[angle], default=None)
 
 
-def find_repetitions(
-    angles: Angles, main_angle: str | None = None, rising: bool | None = None, cycles: bool = False
-) -> Repetitions:
+def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool | None = None) -> Repetitions:
     """Find the repetitions of a movement: excursions of one angle, out and back.
 
     The angle is low-passed for this purpose alone. A repetition begins where it rests, at that end of its range near
@@ -100,7 +90,6 @@ def find_repetitions(
     ----------
     main_angle : as ``right_elbow_flexion``; None: that of `find_main_angle`
     rising : the angle grows first in a repetition; None: by where it rests
-    cycles : a repetition lasts until the next one begins, and not only until the angle is back
 
     Raises
     ------
@@ -127,8 +116,6 @@ def find_repetitions(
     if rising is None:
         rising = _rests_low(signal, low, high)
     spans = _find_spans(angles.time, signal if rising else -signal, float(high - low))
-    if cycles:
-        spans = _close_cycles(spans)
     none = none._replace(rising=rising)
     if len(spans) < MIN_REPETITIONS:
         times = ("no time", "once", "twice")[len(spans)]
@@ -200,25 +187,17 @@ def _find_spans(time: np.ndarray, signal: np.ndarray, full_range: float) -> np.n
     excursions = _find_excursions(signal, FIRST_SHARE * full_range)
     if not excursions:
         return _NO_SPANS
-    usual = float(np.median([_size(signal, *each) for each in excursions]))
+    usual = float(np.median([signal[peak] - 0.5 * (signal[a] + signal[b]) for a, peak, b in excursions]))
     rate = np.gradient(signal, time)
     spans = []
     for before, peak, after in _find_excursions(signal, SHARE * usual):
         up, down = slice(before, peak + 1), slice(peak, after + 1)
         start = _find_onset(signal[up], rate[up], cut=before == 0)
         end = _find_onset(signal[down][::-1], -rate[down][::-1], cut=after == len(signal) - 1)
-        if start is not None and end is not None and _size(signal, before, peak, after) <= MAX_SHARE * usual:
+        size = signal[peak] - 0.5 * (signal[before] + signal[after])
+        if start is not None and end is not None and size <= MAX_SHARE * usual:
             spans.append((time[before + start], time[after - end]))
     return np.array(spans).reshape(-1, 2)
-
-
-def _close_cycles(spans: np.ndarray) -> np.ndarray:
-    """Spans (r, 2) [s] from one begin to the next, without those that a rest makes last twice as long."""
-    if len(spans) < 2:
-        return spans[:0]
-    cycles = np.column_stack([spans[:-1, 0], spans[1:, 0]])
-    durations = np.diff(cycles, axis=1)[:, 0]
-    return cycles[durations < MAX_SHARE * np.median(durations)]
 
 
 def _find_onset(signal: np.ndarray, rate: np.ndarray, *, cut: bool) -> int | None:
@@ -230,10 +209,6 @@ def _find_onset(signal: np.ndarray, rate: np.ndarray, *, cut: bool) -> int | Non
     if rests.any():
         return int(np.flatnonzero(rests)[-1])
     return None if cut and rate[0] > CUT_SHARE * rate.max() else 0
-
-
-def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
-    return float(signal[peak] - 0.5 * (signal[before] + signal[after]))
 
 
 def _find_excursions(signal: np.ndarray, least: float) -> list[tuple[int, int, int]]:
@@ -251,3 +226,69 @@ def _find_excursions(signal: np.ndarray, least: float) -> list[tuple[int, int, i
         (first + int(np.argmin(signal[first : peak + 1])), peak, peak + int(np.argmin(signal[peak : last + 1])))
         for first, peak, last in zip(ends, ends[1:], ends[2:], strict=False)
     ]
+
+
+# Curves ------------------------------------------------------------------------------------------------------------
+
+
+class MeanCurve(NamedTuple):
+    """The curves of one angle over repetitions; NaN where fewer than two, or half of them, are determined."""
+
+    curves: np.ndarray  # (r, POINTS) [rad], NaN where a repetition is not determined
+    mean: np.ndarray  # (POINTS,) [rad]
+    sd: np.ndarray  # (POINTS,) [rad], between repetitions, with r − 1
+    std: np.ndarray  # (POINTS,) [rad], what the pose states for one repetition, root mean square
+    n: np.ndarray  # (POINTS,) repetitions that are determined
+    cmc: float  # `compute_cmc`
+
+
+def normalize_time(time: np.ndarray, values: np.ndarray, spans: np.ndarray) -> np.ndarray:
+    """Return values (n, k) at `POINTS` even times of each span (r, 2) [s], linear between samples: (r, POINTS, k)."""
+    curves = np.empty((len(spans), POINTS, values.shape[1]))
+    for row, (begin, end) in zip(curves, spans, strict=True):
+        at = begin + (end - begin) * PERCENT / 100.0
+        for k in range(values.shape[1]):
+            row[:, k] = np.interp(at, time, values[:, k])
+    return curves
+
+
+def compute_cmc(curves: np.ndarray) -> float:
+    """Compute the coefficient of multiple correlation of curves (r, p) of one session, 1 where they are equal.
+
+    Kadaba et al. 1989, "Repeatability of kinematic, kinetic, and electromyographic data in normal adult gait", Journal
+    of Orthopaedic Research 7:849–860, its adjusted coefficient within a day. 0 where the curves differ from each other
+    by as much as they move; NaN of fewer than two curves, or without a point that all have.
+    """
+    curves = curves[:, np.isfinite(curves).all(axis=0)]
+    r, p = curves.shape
+    if r < 2 or p < 2:
+        return float("nan")
+    within = np.square(curves - curves.mean(axis=0)).sum() / (p * (r - 1))
+    total = np.square(curves - curves.mean()).sum() / (r * p - 1)
+    return float(np.sqrt(max(0.0, 1.0 - within / total))) if total > 0.0 else float("nan")
+
+
+def compute_mean_curves(angles: Angles, spans: np.ndarray) -> dict[str, tuple[MeanCurve, ...]]:
+    """Compute joint → the curves of its three angles over the repetitions `spans` (r, 2) [s]."""
+    curves = {}
+    for name, joint in angles.joints.items():
+        variance = np.full_like(joint.values, np.nan) if joint.std is None else joint.std**2
+        hidden = np.column_stack([joint.hidden(k) for k in range(3)])
+        values, variances = (
+            normalize_time(angles.time, np.where(hidden, np.nan, each), spans) for each in (joint.values, variance)
+        )
+        curves[name] = tuple(_mean_curve(values[:, :, k], variances[:, :, k]) for k in range(3))
+    return curves
+
+
+def _mean_curve(curves: np.ndarray, variances: np.ndarray) -> MeanCurve:
+    known = np.isfinite(curves)
+    means = np.where(known, curves, 0.0).sum(axis=1) / np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+    curves = curves - count_turns(means)[:, None]
+    n = known.sum(axis=0)
+    enough = (n >= 2) & (2 * n >= len(curves))
+    mean = np.where(known, curves, 0.0).sum(axis=0) / np.maximum(n, 1)
+    sd = np.sqrt(np.where(known, np.square(curves - mean), 0.0).sum(axis=0) / np.maximum(n - 1, 1))
+    std = np.sqrt(np.where(known, variances, 0.0).sum(axis=0) / np.maximum(n, 1))
+    mean, sd, std = (np.where(enough, each, np.nan) for each in (mean, sd, std))
+    return MeanCurve(curves, mean, sd, std, n, compute_cmc(curves))

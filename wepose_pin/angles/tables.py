@@ -44,11 +44,12 @@ def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(No
     """Range of motion and peak rates of one joint in a part of the samples; `time` (n,) [s]."""
     time, values, gap, near_lock = time[part], joint.values[part], joint.gap[part], joint.near_lock[part]
     start = part.start or 0
-    m = _window(time)
+    m = max(1, round(RATE_WINDOW_S / float(np.median(np.diff(time))))) if len(time) > 1 else 1
     span = time[m:] - time[:-m]
     lowest, highest, peak_rate = (np.full(3, np.nan) for _ in range(3))
     samples = np.full((3, 4), -1)
-    sound = np.flatnonzero(_without_bad(gap | near_lock, m))
+    bad = np.concatenate([[0], np.cumsum(gap | near_lock)])
+    sound = np.flatnonzero(bad[m + 1 :] == bad[: -m - 1])  # none of the samples k … k + m is bad
     for k in range(3):
         usable = np.flatnonzero(~joint.hidden(k)[part])
         if len(usable):
@@ -61,19 +62,6 @@ def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(No
             samples[k, 2:] = first, first + m
             peak_rate[k] = rates.max()
     return JointSummary(lowest, highest, peak_rate, float(np.mean(near_lock)), float(np.mean(gap)), samples)
-
-
-def _window(time: np.ndarray) -> int:
-    """How many samples make `RATE_WINDOW_S`, at least one."""
-    if len(time) < 2:
-        return 1
-    return max(1, round(RATE_WINDOW_S / float(np.median(np.diff(time)))))
-
-
-def _without_bad(bad: np.ndarray, m: int) -> np.ndarray:
-    """(n − m,) bool: none of the samples k … k + m is `bad`."""
-    count = np.concatenate([[0], np.cumsum(bad)])
-    return count[m + 1 :] == count[: -m - 1]
 
 
 def compute_summary_std(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:
@@ -124,22 +112,20 @@ def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np
 
 def summary_table(angles: Angles) -> pl.DataFrame:
     """`summary` in degrees, a row an angle; values of the joint are in each of its three rows."""
-    rows = []
-    for name, ranges in summary(angles).items():
-        for k, angle in enumerate(angles[name].names):
-            rows.append(
-                {
-                    "joint": name,
-                    "angle": angle,
-                    "lowest_deg": np.degrees(ranges.lowest[k]),
-                    "highest_deg": np.degrees(ranges.highest[k]),
-                    "range_deg": np.degrees(ranges.range[k]),
-                    "peak_rate_deg_s": np.degrees(ranges.peak_rate[k]),
-                    "joint_near_lock": ranges.near_lock,
-                    "joint_gap": ranges.gap,
-                }
-            )
-    return pl.DataFrame(rows)
+    return pl.DataFrame(
+        {
+            "joint": name,
+            "angle": angle,
+            "lowest_deg": np.degrees(ranges.lowest[k]),
+            "highest_deg": np.degrees(ranges.highest[k]),
+            "range_deg": np.degrees(ranges.range[k]),
+            "peak_rate_deg_s": np.degrees(ranges.peak_rate[k]),
+            "joint_near_lock": ranges.near_lock,
+            "joint_gap": ranges.gap,
+        }
+        for name, ranges in summary(angles).items()
+        for k, angle in enumerate(angles[name].names)
+    )
 
 
 def angle_table(angles: Angles) -> pl.DataFrame:

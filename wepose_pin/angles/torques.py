@@ -28,23 +28,14 @@ _LEAST_SAMPLES = 11
 
 @dataclass(frozen=True)
 class Torques:
-    """The torques of joints over time.
+    """The torques of joints over time."""
 
-    Parameters
-    ----------
-    time : (n,) [s]
-    torque : joint → (n, k) [Nm], of a prismatic joint [N]; k = 1, of a spherical joint 3: along the axes of its frame
-    q, v : (n, nq), (n, nv) smoothed configuration and its derivative, what the torques were made from
-    cutoff_hz : of the smoothing
-    mass : [kg] of all that moves
-    """
-
-    time: np.ndarray
-    torque: Mapping[str, np.ndarray]
-    q: np.ndarray
-    v: np.ndarray
-    cutoff_hz: float
-    mass: float
+    time: np.ndarray  # (n,) [s]
+    torque: Mapping[str, np.ndarray]  # joint → (n, 1), of a spherical one (n, 3) along its frame [Nm]; prismatic: [N]
+    q: np.ndarray  # (n, nq) smoothed configuration, from which the torques were made
+    v: np.ndarray  # (n, nv) its derivative
+    cutoff_hz: float  # of the smoothing
+    mass: float  # [kg] of all that moves
 
     def summary(self) -> dict[str, Any]:
         """For ``summary.json``."""
@@ -66,7 +57,7 @@ def joint_torques(
     cutoff_hz: float = CUTOFF_HZ,
     joints: Collection[int] | None = None,
 ) -> Torques:
-    """Torques of the joints that bear a mass, by `pin.rnea`.
+    """Compute the torques of the joints that bear a mass, by `pin.rnea`.
 
     Parameters
     ----------
@@ -93,9 +84,16 @@ def joint_torques(
     rate_hz = (len(time) - 1) / float(time[-1] - time[0])
     if not 0.0 < cutoff_hz < 0.5 * rate_hz:
         raise BadOption(f"a cut-off of {cutoff_hz:g} Hz; above 0 and below half the rate, {0.5 * rate_hz:g} Hz")
+    q = q.copy()
+    for joint in range(1, model.njoints):  # signs of quaternions that do not jump, angles of hinges unwrapped
+        first, n = model.idx_qs[joint], model.nqs[joint]
+        if n == 4:
+            q[:, first : first + 4] = unwrap_signs(q[:, first : first + 4])
+        elif n == 1 and "Prismatic" not in model.joints[joint].shortname():
+            q[:, first] = np.unwrap(q[:, first])
     # The motion is mirrored for a second beyond each end, where the filter's transient decays.
     pad = min(len(time) - 1, max(_LEAST_SAMPLES - 1, round(rate_hz)))
-    smooth = low_pass(_unwrap(model, q), cutoff_hz, rate_hz, pad)
+    smooth = low_pass(q, cutoff_hz, rate_hz, pad)
     q = np.array([pin.normalize(model, row) for row in smooth])
     # Central differences; the ends repeat.
     half = np.array([pin.difference(model, a, b) for a, b in pairwise(q)]) * rate_hz
@@ -121,18 +119,6 @@ def pose_torques(tracked: TrackResult, cutoff_hz: float = CUTOFF_HZ) -> Torques:
     moved = {joint for name, chain in model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
     joints = None if model.table.is_mechanism else moved
     return joint_torques(model.pin, tracked.time, tracked.q, cutoff_hz, joints)
-
-
-def _unwrap(model: pin.Model, q: np.ndarray) -> np.ndarray:
-    """Signs of quaternions that do not jump, angles of hinges unwrapped."""
-    q = q.copy()
-    for joint in range(1, model.njoints):
-        first, n = model.idx_qs[joint], model.nqs[joint]
-        if n == 4:
-            q[:, first : first + 4] = unwrap_signs(q[:, first : first + 4])
-        elif n == 1 and "Prismatic" not in model.joints[joint].shortname():
-            q[:, first] = np.unwrap(q[:, first])
-    return q
 
 
 def torque_table(torques: Torques) -> pl.DataFrame:

@@ -27,7 +27,6 @@ def angles(
     force: Force = False,
     repetitions: Annotated[PhaseName | None, MORE] = None,
     main_angle: Annotated[Angle | None, MORE] = None,
-    cycles: Annotated[bool, MORE] = False,
     shoulder: Annotated[Literal["auto", "YXY", "XZY", "ZXY"], MORE] = "auto",
 ) -> None:
     """Write the joint angles of results as tables and figures for a paper.
@@ -57,8 +56,6 @@ def angles(
         Take each interval of this phase as a repetition. Without it repetitions are found.
     main_angle
         Find repetitions by this angle, such as right_elbow_flexion. Without it by the angle of the largest range.
-    cycles
-        Let a repetition last until the next one begins, as a gait cycle does, and not only until the angle is back.
     shoulder
         Use this sequence for the shoulder: YXY (plane of elevation, elevation, internal rotation), XZY or ZXY (flexion
         and adduction: no gimbal lock where the arm hangs). auto: YXY, or if it is near gimbal lock in the first result
@@ -70,8 +67,7 @@ def angles(
     from polars import selectors
 
     from ..angles import diagnose_lock
-    from ..angles import movement_tables as build
-    from ..angles.movement import MovementOptions, analyze_movement
+    from ..angles import movement as build
     from ..documents import whole_folder
     from ..report import angles as report
     from ..report.page import write_pages
@@ -79,13 +75,12 @@ def angles(
     from ..writers.provenance import collect_provenance, write_provenance
     from ..writers.result import read_phases
 
-    finds = f"--main-angle {main_angle}" if main_angle is not None else "--cycles" if cycles else ""
-    if finds and repetitions is not None:
-        raise BadOption(f"{finds}: finds repetitions, and --repetitions {repetitions} marks them; leave one out")
+    if main_angle is not None and repetitions is not None:
+        raise BadOption(f"--main-angle {main_angle} finds repetitions, and --repetitions {repetitions} marks them")
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
             # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
-            chosen = MovementOptions(shoulder, low_pass_hz, repetitions, main_angle, None, cycles)
+            chosen = build.MovementOptions(shoulder, low_pass_hz, repetitions, main_angle)
             movements: list[Movement] = []
             for k, each in enumerate((result, *further), 1):
                 progress("reading", 0.7 * (k - 1) / (1 + len(further)))
@@ -93,7 +88,7 @@ def angles(
                 name = str(about.get("recording") or each.name)
                 name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
                 try:
-                    movement = analyze_movement(name, pose, read_phases(about), chosen)
+                    movement = build.analyze_movement(name, pose, read_phases(about), chosen)
                 except WrongOption as error:
                     raise BadOption(f"{each}: {error}" if further else str(error)) from None
                 movements.append(movement)

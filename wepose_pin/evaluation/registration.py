@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..body.kinematics import Pose
 from ..errors import BadData
-from ..recording import AXES, format_span
+from ..recording import AXES
 from ..rotations import conjugate, multiply
 
 FITTED = 1.0 / 3.0  # share of the time that is not scored
@@ -34,27 +34,16 @@ _ROUNDING_S = 1e-9  # [s] by which equal times may differ
 
 @dataclass(frozen=True)
 class Registration:
-    """How a reference was brought to a pose.
+    """How a reference was brought to a pose."""
 
-    Parameters
-    ----------
-    offset_s : added to the reference's times
-    correlation : of the speeds at that offset; NaN: the offset was stated
-    up : the axis of the reference's world that is up
-    heading_deg : by which its world was then rotated about the vertical
-    shift_m : x, y, z by which its points were moved
-    frames_deg : segment → angle of the constant rotation of its frame; empty: frames are as the reference has them
-    fitted, scored : from, to [s], of the pose
-    """
-
-    offset_s: float
-    correlation: float
-    up: str
-    heading_deg: float
-    shift_m: tuple[float, float, float]
-    fitted: tuple[float, float]
+    offset_s: float  # added to the reference's times
+    correlation: float  # of the speeds at that offset; NaN: the offset was stated
+    up: str  # the axis of the reference's world that is up
+    heading_deg: float  # by which its world was then rotated about the vertical
+    shift_m: tuple[float, float, float]  # x, y, z by which its points were moved
+    fitted: tuple[float, float]  # from, to [s], of the pose; as the next
     scored: tuple[float, float]
-    frames_deg: Mapping[str, float] = field(default_factory=dict)
+    frames_deg: Mapping[str, float] = field(default_factory=dict)  # segment → constant rotation of its frame, if fitted
 
 
 def register(
@@ -94,8 +83,7 @@ def register(
     first, last = max(begin, float(truth.time[0])), min(end, float(truth.time[-1]))
     fit_end = max(fit_end, first + FITTED * (last - first))
     if fit_end - first < SHORTEST_S or last - fit_end < SHORTEST_S:
-        shared = max(0.0, last - first)
-        raise BadData(f"pose ({format_span((begin, end))}) and reference share {shared:.1f} s; {needed}")
+        raise BadData(f"pose and reference share {max(0.0, last - first):.1f} s; {needed}")
     time = pose.time[(pose.time >= first) & (pose.time <= fit_end)]
     R_WV, axis, heading = _find_world(pose, common, time, up, frames)
     quat_WT = {name: multiply(R_WV.as_quat(), quat_VT) for name, quat_VT in truth.quat_WL.items()}
@@ -107,19 +95,16 @@ def register(
             quat_WT[name] = multiply(quat_WT[name], R_TL.as_quat())
             turned[name] = float(np.degrees(R_TL.magnitude()))
     points = {name: p_V @ R_WV.as_matrix().T for name, p_V in truth.points.items()}
-    shift = np.zeros(3)
-    if names:
-        off = [
-            sample_points(pose.time, pose.points[name], time) - sample_points(truth.time, points[name], time)
-            for name in names
-        ]
-        known = np.isfinite(off).all(axis=(0, 2))
-        shift = np.median(np.mean(off, axis=0)[known], axis=0) if known.any() else shift
-    x, y, z = shift.tolist()
-    registration = Registration(
-        offset_s, correlation, axis, heading, (x, y, z), (first, float(fit_end)), (float(fit_end), last), turned
-    )
-    return replace(truth, quat_WL=quat_WT, points={name: p + shift for name, p in points.items()}), registration
+    off = [
+        sample_points(pose.time, pose.points[name], time) - sample_points(truth.time, points[name], time)
+        for name in names
+    ]
+    apart = np.mean(off, axis=0)[np.isfinite(off).all(axis=(0, 2))] if names else np.empty((0, 3))
+    x, y, z = np.median(apart, axis=0).tolist() if len(apart) else (0.0, 0.0, 0.0)
+    points = {name: p + (x, y, z) for name, p in points.items()}
+    spans = (first, float(fit_end)), (float(fit_end), last)
+    registration = Registration(offset_s, correlation, axis, heading, (x, y, z), *spans, turned)
+    return replace(truth, quat_WL=quat_WT, points=points), registration
 
 
 def _is_known(values: np.ndarray | None) -> bool:
@@ -148,9 +133,8 @@ def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[
     best = int(np.argmax(score))
     if score[best] < LEAST_CORRELATION:
         raise BadData(
-            f"no offset of the clocks fits in the first {fitted[1] - fitted[0]:.0f} s of the pose: speeds correlate "
-            f"by {score[best]:.2f} at best, {LEAST_CORRELATION:g} are needed; state it as --time-offset, or is it "
-            f"another recording?"
+            f"no offset of the clocks fits in the first {fitted[1] - fitted[0]:.0f} s of the pose: speeds correlate by "
+            f"{score[best]:.2f} at best; state it as --time-offset, or is it another recording?"
         )
     lag = (best - (ours.shape[1] - 1)) * STEP_S  # of ours in theirs
     coarse = fitted[0] - (float(truth.time[0]) + lag)
@@ -165,9 +149,7 @@ def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[
             correlations.append(np.corrcoef(a[:n][both], b[:n][both])[0, 1] if moved else 0.0)
         return 1.0 - float(np.mean(correlations))
 
-    minimum = minimize_scalar(
-        compute_loss, bounds=(coarse - STEP_S, coarse + STEP_S), method="bounded", options={"xatol": 1e-4}
-    )
+    minimum = minimize_scalar(compute_loss, bounds=(coarse - STEP_S, coarse + STEP_S), options={"xatol": 1e-4})
     return float(minimum.x), 1.0 - float(minimum.fun)
 
 
@@ -222,10 +204,9 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
     if up is None:
         up = max(AXES, key=lambda axis: float(full[2] @ AXES[axis]))
         if full[2] @ AXES[up] < UPRIGHT:
-            off = np.degrees(np.arccos(np.clip(full[2] @ AXES[up], -1.0, 1.0)))
             raise BadData(
-                f"no axis of the reference's world is up: {up} is nearest, {off:.0f} deg off; where its segments' "
-                f"frames are not ours, --fit segments fits them too"
+                f"no axis of the reference's world is up: {up} is nearest; where its segments' frames are not ours, "
+                "--fit segments fits them too"
             )
     axis_V = np.asarray(AXES[up])
     across = np.cross(axis_V, AXES["+z"])

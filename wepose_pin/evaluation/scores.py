@@ -79,31 +79,17 @@ class Uncertainty(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors over the time that pose and reference share.
+    """Errors over the time that pose and reference share."""
 
-    Parameters
-    ----------
-    attitude : segment → `AttitudeError` [deg]: `roll`, `pitch`, `yaw` (mean, standard deviation), `inclination_rmse`,
-        `heading_rmse`, `total_rmse`, `drift_deg_min` [deg/min]
-    joints : joint → angle → `AngleError` [deg]: `mean`, `rmse`, `worst`, limits of agreement, `icc`, `range`
-    position : point → `PositionError` [mm], relative to the root: `mean`, `std`, `rmse`, `worst`
-    position_on_limb : the same relative to where its limb begins, such as the middle of the shoulders
-    attitude_uncertainty, position_uncertainty : segment or point → `Uncertainty`, how far the stated covariance agrees
-        with the error: `nees` (3 is right), `within_1`, `within_2` (shares within one and two standard deviations)
-    interval : from, to [s], that is compared
-    samples : number of samples that are compared
-    registration : how the reference was brought to the pose; None: it is taken as it is
-    """
-
-    attitude: dict[str, AttitudeError]
-    joints: dict[str, dict[str, AngleError]]
-    position: dict[str, PositionError]
-    position_on_limb: dict[str, PositionError]
-    attitude_uncertainty: dict[str, Uncertainty]
-    position_uncertainty: dict[str, Uncertainty]
-    interval: tuple[float, float]
-    samples: int
-    registration: Registration | None = None
+    attitude: dict[str, AttitudeError]  # segment → [deg]
+    joints: dict[str, dict[str, AngleError]]  # joint → angle → [deg]
+    position: dict[str, PositionError]  # point → [mm], relative to the root
+    position_on_limb: dict[str, PositionError]  # the same relative to where its limb begins, as between the shoulders
+    attitude_uncertainty: dict[str, Uncertainty]  # segment → how far the stated covariance agrees with the error
+    position_uncertainty: dict[str, Uncertainty]  # point → the same
+    interval: tuple[float, float]  # from, to [s], that is compared
+    samples: int  # that are compared
+    registration: Registration | None = None  # how the reference was brought to the pose; None: it is taken as it is
 
     def __repr__(self) -> str:
         total = max((error.total_rmse for error in self.attitude.values()), default=float("nan"))
@@ -202,21 +188,16 @@ def evaluate(
         if point in pose.point_cov:
             position_uncertainty[point] = uncertainty(difference[known], pose.point_cov[point][inside][known])
         limb = table.find_limb(point)
-        if limb is not None:
-            estimated, true = (_find_middle(each, limb.origin) for each in (pose, truth))
-            on_limb = difference - (estimated[inside] - sample_points(truth.time, true, time))
+        if limb is not None and all(set(limb.origin) <= set(each.points) for each in (pose, truth)):
+            middle, true = (np.mean([each.points[name] for name in limb.origin], axis=0) for each in (pose, truth))
+            on_limb = difference - (middle[inside] - sample_points(truth.time, true, time))
             known = np.isfinite(on_limb).all(axis=1)
             if known.any():
                 position_on_limb[point] = position_error(on_limb[known])
-    for kind, common, errors in (
-        ("orientation of a segment", pose.quat_WL.keys() & truth.quat_WL.keys(), attitude),
-        ("position of a point", pose.points.keys() & truth.points.keys(), position),
-    ):
-        if common and not errors:
-            raise BadData(f"no {kind} is known to both at a time: of {', '.join(sorted(common))} one of the two is NaN")
     if not attitude and not position:
         raise BadData(
-            "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
+            "pose and reference have no segment and no point in common, or one of the two is NaN; columns as in "
+            "pose.parquet are needed"
         )
     joints = _joint_errors(pose, inside, true_WL)
     uncertainties = attitude_uncertainty, position_uncertainty
@@ -249,23 +230,22 @@ def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]
     return errors
 
 
-def _find_middle(pose: Pose, points: tuple[str, ...]) -> np.ndarray:
-    """Middle of points (n, 3) [m]; NaN where one is not known."""
-    missing = np.full((len(pose.time), 3), np.nan)
-    return np.asarray(np.mean([pose.points.get(point, missing) for point in points], axis=0))
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def attitude_error(estimated: Rotation, true: Rotation, time: np.ndarray) -> AttitudeError:
-    """Attitude error of n orientations in W at `time` (n,) [s]."""
+    """Compute the attitude error of n orientations in W at `time` (n,) [s]."""
     error = estimated * true.inv()
-    yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)).T
+    angles = np.abs(error.as_euler("ZYX", degrees=True)).T
     heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
     inclination = np.degrees(np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1.0, 1.0)))
     slope = np.polyfit(time - time[0], heading, 1)[0] if np.ptp(time) > 0.0 else 0.0
+    yaw, pitch, roll = ((float(angle.mean()), float(angle.std())) for angle in angles)
     return AttitudeError(
-        roll=(float(roll.mean()), float(roll.std())),
-        pitch=(float(pitch.mean()), float(pitch.std())),
-        yaw=(float(yaw.mean()), float(yaw.std())),
+        roll=roll,
+        pitch=pitch,
+        yaw=yaw,
         inclination_rmse=_rms(inclination),
         heading_rmse=_rms(heading),
         total_rmse=_rms(np.degrees(error.magnitude())),
@@ -273,12 +253,8 @@ def attitude_error(estimated: Rotation, true: Rotation, time: np.ndarray) -> Att
     )
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
-    """Errors (n, 3) against their stated covariances (n, 3, 3); samples without one are left out. NaN where all are."""
+    """Compare errors (n, 3) with stated covariances (n, 3, 3), without samples that have none; NaN where all are."""
     stated = np.isfinite(cov).all(axis=(1, 2))
     eigenvalues = np.linalg.eigvalsh(cov[stated])
     stated[stated] = eigenvalues[:, 0] > SINGULAR * eigenvalues[:, 2]
@@ -294,7 +270,7 @@ def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
 
 
 def angle_error(estimated: np.ndarray, true: np.ndarray) -> AngleError:
-    """Error of n values (n,) [deg] against a reference's (n,)."""
+    """Compute the error of values (n,) [deg] against a reference's (n,)."""
     error = estimated - true
     mean, std = float(error.mean()), float(error.std(ddof=1)) if len(error) > 1 else np.nan
     limits = mean - LIMITS * std, mean + LIMITS * std

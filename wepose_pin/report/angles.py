@@ -10,9 +10,8 @@ import polars as pl
 from matplotlib.axes import Axes
 
 from ..angles import Angles, JointAngles, group_sides
-from ..angles.curves import PERCENT, MeanCurve
 from ..angles.movement import MEASURES, Movement
-from ..angles.repetitions import list_angles
+from ..angles.repetitions import PERCENT, MeanCurve, list_angles
 from .figures import (
     BAND,
     SESSION_COLOURS,
@@ -57,7 +56,7 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
 
     Parameters
     ----------
-    tables : by the names of their files, of `movement_tables`
+    tables : by the names of their files, as in the folder
     figures : of `draw_figures`; the page shows the first of them
     """
     over_time = [figure for name, figure in figures.items() if name.startswith("angles")][:1]
