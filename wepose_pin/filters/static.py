@@ -21,43 +21,13 @@ from scipy.special import gammainc, gammaincinv
 
 from ..arguments import NonNegative, Positive, Range, check_fields, format_settings
 from ..compilation import inlined, kernel
-from ..errors import BadData, BadOption
+from ..errors import BadOption
+from .base import make_record, prepare_samples
 from .noise import BLOCK_S, SensorNoise
 
-# A sample is gyro [rad/s] (3), accel/g (3) and the norm of accel/g.
-SIGNALS = 7
-# Sums over samples, of their differences from an anchor. Upper triangles are xx xy xz yy yz zz.
-SUMS = np.dtype([("signals", float, SIGNALS), ("products", float, (2, 6)), ("norm_square", float)], align=True)
-# Memory of the detector of one sensor, its windows aside.
-DETECTOR = np.dtype(
-    [
-        ("samples", np.int64),  # in the current block
-        ("has_block", np.bool_),  # there is a block before it
-        ("anchor", float, SIGNALS),  # the last sample of the block before
-        ("sums", SUMS),  # of the current block so far, while it does not move
-        ("moves", np.bool_),  # a sample of it is too far from the anchor for any static window
-        ("moves_until", np.int64),  # of the block before, the last sample that is; `tail` begins after it
-        ("inverse_gravity", float),  # [s²/m]
-        # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
-        ("limits", float, (2, 6)),
-        ("norm_variance", float),
-        ("norm_error", float),
-        # condition (6)
-        ("newest", np.int64),  # samples of the newest part
-        ("rate_change", float, 6),  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
-        # condition (5): the known bias
-        ("bias", float, 3),  # [rad/s]
-        ("bias_var", float),  # [rad²/s²]
-        ("average_rate", float),  # [rad/s] about the vertical, beyond the known bias
-        ("squared_stds", float),  # `StaticTest.rate_stds`²
-        ("window_var", float),  # [rad²/s²] of a window's mean
-        ("average_var", float),  # [rad²/s²] of the average
-        ("spread_var", float),  # [rad²/s²]
-        ("walk_var", float),  # [rad²/s²] by which the known bias ages in a sample
-        ("fade", float),  # share of the average that a sample replaces
-    ],
-    align=True,
-)
+# A sample is gyro [rad/s] (3), accel/g (3) and the norm of accel/g. Sums over samples are of these, of the products of
+# gyro and of accel (upper triangles xx xy xz yy yz zz), and of the squared norm, each of differences from an anchor.
+SIGNALS, SUMS = 7, 20
 _UPPER = np.triu_indices(3)
 
 
@@ -132,234 +102,200 @@ class StaticDetector:
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
         self.test = test or USUAL_TEST
         n = self.test.samples(rate_hz)
-        self._detector = _first_state(noise, rate_hz, self.test)
-        self._block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
-        # Sums of the block before from each of its samples to its end; where no window begins any more, `signals` are
-        # those of the current block up to the sample.
-        self._tail = np.zeros(n, SUMS)
+        self._model = _build_model(noise, rate_hz, self.test)
+        self._state = make_record(
+            samples=np.int64(0),  # in the current block
+            has_block=np.bool_(False),  # there is a block before it
+            block=np.zeros((n, SIGNALS)),  # samples of the current block, then of the one before
+            anchor=np.zeros(SIGNALS),  # the last sample of the block before
+            head=np.zeros(SUMS),  # sums of the current block so far, while it does not move
+            tail=np.zeros((n, SUMS)),  # sums of the block before, from each of its samples to its end
+            window=np.zeros(SUMS),  # sums of the window
+            moves=np.bool_(False),  # a sample of the block is too far from the anchor for any static window
+            moves_until=np.int64(-1),  # of the block before, the last sample that is; `tail` begins after it
+            bias=noise.gyro_bias,  # [rad/s] the known bias of condition (5)
+            bias_var=np.trace(noise.gyro_bias_cov) / 3.0,  # [rad²/s²]
+            average_rate=0.0,  # [rad/s] about the vertical, beyond the known bias
+        )
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
-        if len(gyro_S) != len(accel_S):  # the compiled step would read beyond an array's end
-            raise BadData(f"{len(gyro_S)} rows of gyro_S and {len(accel_S)} of accel_S: they must be as many")
-        gyro, accel = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
-        static = np.empty(len(gyro), dtype=np.bool_)
-        _run(self._detector, self._block, self._tail, gyro, accel, static)
+        static = np.empty(len(gyro_S), dtype=np.bool_)
+        gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
+        _run(self._state, self._model, gyro, accel, static)
         return static
 
 
-def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> np.ndarray:
-    """Build the memory of a detector before its first sample, (1,) of `DETECTOR`."""
-    n = test.samples(rate_hz)
-    newest = max(1, round(test.newest_s * rate_hz))
+def _build_model(noise: SensorNoise, rate_hz: float, test: StaticTest) -> np.ndarray:
+    """Build the constants of a detector, a record (1,)."""
+    n, newest = test.samples(rate_hz), max(1, round(test.newest_s * rate_hz))
     dt, window_s = 1.0 / rate_hz, n / rate_hz
-    white, sway = np.trace(noise.gyro_cov) / 3.0 / n, 0.0
-    if noise.gyro_half_second_cov is not None:
-        sway = np.trace(noise.gyro_half_second_cov) / 3.0 * BLOCK_S / window_s
-    detector = np.zeros(1, DETECTOR)
-    values = {
-        "inverse_gravity": 1.0 / noise.gravity,
-        "limits": (n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
-        "norm_error": test.gamma1,
-        "moves_until": -1,
-        "norm_variance": (n - 1) * test.gamma2,
-        "newest": min(newest, n),
-        "rate_change": _bound_rate_change(noise, newest, n, test.rate_stds)[_UPPER],
-        "bias": noise.gyro_bias,
-        "bias_var": np.trace(noise.gyro_bias_cov) / 3.0,
-        "squared_stds": test.rate_stds**2,
-        "window_var": max(white, sway),
-        "average_var": max(white, sway) * window_s / (2.0 * test.averaging_s),
-        "spread_var": test.bias_spread**2,
-        "walk_var": test.bias_walk**2 * dt,
-        "fade": min(1.0, dt / test.averaging_s),
-    }
-    for name, value in values.items():
-        detector[name] = value
-    return detector
-
-
-def _bound_rate_change(noise: SensorNoise, newest: int, n: int, rate_stds: float) -> np.ndarray:
-    """M (3, 3) of condition (6): the inverse covariance of the change, over the square of its bound."""
-    squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, rate_stds**2 / 2.0))  # χ² of three axes, as probable as of one
-    if newest >= n or not 0.0 < squared_bound < np.inf:
-        return np.zeros((3, 3))
-    sway = 0.0 if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
-    return np.linalg.inv(noise.gyro_cov * (1.0 / newest - 1.0 / n) + sway) / squared_bound
+    half_second_cov = np.zeros((3, 3)) if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
+    white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
+    # (6): the inverse covariance of the change, over the square of its bound, χ² of three axes as probable as of one
+    squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
+    rate_change = np.zeros((3, 3))
+    if newest < n and 0.0 < squared_bound < np.inf:
+        change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
+        rate_change = np.linalg.inv(change_cov) / squared_bound
+    return make_record(
+        inverse_gravity=1.0 / noise.gravity,  # [s²/m]
+        # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
+        limits=(n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
+        norm_variance=(n - 1) * test.gamma2,
+        norm_error=test.gamma1,
+        newest=np.int64(min(newest, n)),  # (6): samples of the newest part
+        rate_change=rate_change,  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
+        # condition (5)
+        squared_stds=test.rate_stds**2,
+        window_var=max(white, sway),  # [rad²/s²] of a window's mean
+        average_var=max(white, sway) * window_s / (2.0 * test.averaging_s),  # [rad²/s²] of the average
+        spread_var=test.bias_spread**2,  # [rad²/s²]
+        walk_var=test.bias_walk**2 * dt,  # [rad²/s²] by which the known bias ages in a sample
+        fade=min(1.0, dt / test.averaging_s),  # share of the average that a sample replaces
+    )
 
 
 @inlined
 def _add(sums, before, block, at, anchor):  # type: ignore[no-untyped-def]
     """Fill `sums` with `before` and sample `at` of the block; both may be one."""
     for part in range(2):
-        k = 3 * part
+        k, m = 3 * part, 7 + 6 * part
         x, y, z = block[at, k] - anchor[k], block[at, k + 1] - anchor[k + 1], block[at, k + 2] - anchor[k + 2]
-        signals, products = sums.signals, sums.products[part]
-        signals[k] = before.signals[k] + x
-        signals[k + 1] = before.signals[k + 1] + y
-        signals[k + 2] = before.signals[k + 2] + z
-        products[0], products[1] = before.products[part, 0] + x * x, before.products[part, 1] + x * y
-        products[2], products[3] = before.products[part, 2] + x * z, before.products[part, 3] + y * y
-        products[4], products[5] = before.products[part, 4] + y * z, before.products[part, 5] + z * z
+        sums[k], sums[k + 1], sums[k + 2] = before[k] + x, before[k + 1] + y, before[k + 2] + z
+        sums[m], sums[m + 1], sums[m + 2] = before[m] + x * x, before[m + 1] + x * y, before[m + 2] + x * z
+        sums[m + 3], sums[m + 4], sums[m + 5] = before[m + 3] + y * y, before[m + 4] + y * z, before[m + 5] + z * z
     norm = block[at, 6] - anchor[6]
-    sums.signals[6] = before.signals[6] + norm
-    sums.norm_square = before.norm_square + norm * norm
+    sums[6], sums[19] = before[6] + norm, before[19] + norm * norm
 
 
 @inlined
-def _clear(sums):  # type: ignore[no-untyped-def]
-    for i in range(SIGNALS):
-        sums.signals[i] = 0.0
-    for i in range(6):
-        sums.products[0, i] = sums.products[1, i] = 0.0
-    sums.norm_square = 0.0
-
-
-@inlined
-def _is_far(detector, block, at):  # type: ignore[no-untyped-def]
+def _is_far(state, model, at):  # type: ignore[no-untyped-def]
     """Return whether gyro at a sample is too far from the anchor for any static window with both.
 
     Two samples that differ by d make (N − 1) S ≥ d²/2; twice the limit is beyond rounding. NaN is not far.
     """
-    limit, anchor = detector.limits[0], detector.anchor
+    block, anchor, limit = state.block, state.anchor, model.limits[0]
     x, y, z = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
     return x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
 
 
 @inlined
-def _is_within(detector, rest, part, share):  # type: ignore[no-untyped-def]
+def _is_within(window, limit, part, share):  # type: ignore[no-untyped-def]
     """Conditions (1), `part` 0, and (2): (N − 1)(limit − S) is positive semidefinite: no principal minor is negative.
 
-    The window is the current block and `rest`, that of the one before. NaN says no.
+    NaN says no.
     """
-    head, limit, k = detector.sums, detector.limits[part], 3 * part
-    products, rest_products = head.products[part], rest.products[part]
-    x = head.signals[k] + rest.signals[k]
-    y = head.signals[k + 1] + rest.signals[k + 1]
-    z = head.signals[k + 2] + rest.signals[k + 2]
-    xx = limit[0] - (products[0] + rest_products[0] - x * x * share)
-    yy = limit[3] - (products[3] + rest_products[3] - y * y * share)
-    zz = limit[5] - (products[5] + rest_products[5] - z * z * share)
+    k, first = 3 * part, 7 + 6 * part
+    x, y, z = window[k], window[k + 1], window[k + 2]
+    xx = limit[0] - (window[first] - x * x * share)
+    yy = limit[3] - (window[first + 3] - y * y * share)
+    zz = limit[5] - (window[first + 5] - z * z * share)
     if not (xx >= 0.0 and yy >= 0.0 and zz >= 0.0):
         return False
-    xy = limit[1] - (products[1] + rest_products[1] - x * y * share)
-    xz = limit[2] - (products[2] + rest_products[2] - x * z * share)
-    yz = limit[4] - (products[4] + rest_products[4] - y * z * share)
+    xy = limit[1] - (window[first + 1] - x * y * share)
+    xz = limit[2] - (window[first + 2] - x * z * share)
+    yz = limit[4] - (window[first + 4] - y * z * share)
     if not (xx * yy - xy * xy >= 0.0 and xx * zz - xz * xz >= 0.0 and yy * zz - yz * yz >= 0.0):
         return False
     return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz) >= 0.0
 
 
 @inlined
-def _rate_is_steady(detector, tail, n, gx, gy, gz):  # type: ignore[no-untyped-def]
-    """Condition (6) for a window of n samples whose mean rate is g; the rates are differences from the anchor."""
-    newest, head = detector.newest, detector.sums.signals
-    begin = detector.samples - newest  # first sample of the newest part in the current block
-    x, y, z = head[0] - newest * gx, head[1] - newest * gy, head[2] - newest * gz
+def _rate_is_steady(state, model):  # type: ignore[no-untyped-def]
+    """Condition (6): the mean rate of the newest part is near that of the window."""
+    tail, head, window, newest, M = state.tail, state.head, state.window, model.newest, model.rate_change
+    begin, share = state.samples - newest, newest / len(state.block)  # first sample of the newest part in the block
+    x, y, z = head[0] - share * window[0], head[1] - share * window[1], head[2] - share * window[2]
     if begin < 0:
-        part = tail[n + begin].signals
-        x, y, z = x + part[0], y + part[1], z + part[2]
+        rest = tail[len(state.block) + begin]
+        x, y, z = x + rest[0], y + rest[1], z + rest[2]
     elif begin > 0:
-        part = tail[begin - 1].signals
-        x, y, z = x - part[0], y - part[1], z - part[2]
-    M = detector.rate_change
-    across = M[1] * x * y + M[2] * x * z + M[4] * y * z
-    return M[0] * x * x + M[3] * y * y + M[5] * z * z + 2.0 * across <= newest * newest
+        rest = tail[begin - 1]
+        x, y, z = x - rest[0], y - rest[1], z - rest[2]
+    across = M[0, 1] * x * y + M[0, 2] * x * z + M[1, 2] * y * z
+    return M[0, 0] * x * x + M[1, 1] * y * y + M[2, 2] * z * z + 2.0 * across <= newest * newest
 
 
 @inlined
-def _bias_agrees(detector, window, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Condition (5) for a window of mean rate g and mean specific force a; learns the bias.
-
-    `window`: its length in samples where it passes (1) to (4) and (6); 0 where it does not: the average fades and the
-    known bias ages.
-    """
-    bias = detector.bias
-    detector.bias_var += detector.walk_var
-    if window == 0:
-        detector.average_rate -= detector.fade * detector.average_rate
-        return False
+def _bias_agrees(state, model):  # type: ignore[no-untyped-def]
+    """Condition (5) for a window that passes the others; learns the bias."""
+    bias, anchor, window, n = state.bias, state.anchor, state.window, len(state.block)
+    gx, gy, gz = anchor[0] + window[0] / n, anchor[1] + window[1] / n, anchor[2] + window[2] / n
+    ax, ay, az = anchor[3] + window[3] / n, anchor[4] + window[4] / n, anchor[5] + window[5] / n
     gx, gy, gz = gx - bias[0], gy - bias[1], gz - bias[2]
     off = (gx * ax + gy * ay + gz * az) / np.sqrt(ax * ax + ay * ay + az * az)
-    known = detector.bias_var + detector.spread_var
-    squared_bound = detector.squared_stds * (known + detector.window_var)
+    known = state.bias_var + model.spread_var
+    squared_bound = model.squared_stds * (known + model.window_var)
     agrees = off * off <= squared_bound
     # What enters the average is bounded, so that it is soon forgotten when a fast rotation ends.
     bounded = off if agrees else np.copysign(np.sqrt(squared_bound), off)
-    detector.average_rate += detector.fade * (bounded - detector.average_rate)
-    average = detector.average_rate
-    if not agrees or average * average > detector.squared_stds * (known + detector.average_var):
+    state.average_rate += model.fade * (bounded - state.average_rate)
+    average = state.average_rate
+    if not agrees or average * average > model.squared_stds * (known + model.average_var):
         return False
     # A window's mean measures the bias; its samples share that, since windows overlap.
-    variance = detector.bias_var
-    gain = variance / (variance + window * detector.window_var) if variance > 0.0 else 0.0
+    variance = state.bias_var
+    gain = variance / (variance + n * model.window_var) if variance > 0.0 else 0.0
     bias[0] += gain * gx
     bias[1] += gain * gy
     bias[2] += gain * gz
-    detector.bias_var -= gain * variance
+    state.bias_var -= gain * variance
     return True
 
 
 @inlined
-def _step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """One sample: is the window that it ends static?"""
-    n, at, anchor, head = len(block), detector.samples, detector.anchor, detector.sums
-    ax, ay, az = ax * detector.inverse_gravity, ay * detector.inverse_gravity, az * detector.inverse_gravity
-    block[at, 0], block[at, 1], block[at, 2] = gx, gy, gz
-    block[at, 3], block[at, 4], block[at, 5] = ax, ay, az
+def _add_sample(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Add a sample; return where the window begins in the block before, or −1 where it is not full or surely moves."""
+    block, tail, at, anchor, head = state.block, state.tail, state.samples, state.anchor, state.head
+    ax, ay, az = ax * model.inverse_gravity, ay * model.inverse_gravity, az * model.inverse_gravity
     norm = np.sqrt(ax * ax + ay * ay + az * az)
-    block[at, 6] = norm
-    first = at + 1  # where the window begins in the block before
-    if first < n:
-        detector.samples = first
-        if not detector.moves:
-            detector.moves = detector.has_block and _is_far(detector, block, at)
+    block[at, 0], block[at, 1], block[at, 2], block[at, 6] = gx, gy, gz, norm
+    block[at, 3], block[at, 4], block[at, 5] = ax, ay, az
+    state.samples = at + 1
+    if state.samples < len(block):
+        if not state.moves:
+            state.moves = state.has_block and _is_far(state, model, at)
             _add(head, head, block, at, anchor)
             # No window needs the sums of the block before from here; those up to here serve condition (6).
-            for i in range(3):
-                tail[at].signals[i] = head.signals[i]
-        if not detector.has_block:
-            detector.bias_var += detector.walk_var
-            return False
-    else:  # the block is full and is the window: sum it up backwards, begin the next
-        if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
-            for m in range(SIGNALS):
-                anchor[m] = block[at, m]
-        _clear(head)
-        _add(tail[at], head, block, at, anchor)
-        detector.moves, detector.moves_until = False, -1
-        for before in range(at - 1, -1, -1):
-            if _is_far(detector, block, before):
-                detector.moves_until = before
-                break
-            _add(tail[before], tail[before + 1], block, before, anchor)
-        detector.samples, detector.has_block, first = 0, True, 0
-    if detector.moves or first <= detector.moves_until:
-        return _bias_agrees(detector, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    rest, share = tail[first], 1.0 / n
-    norm = head.signals[6] + rest.signals[6]
-    static = (
-        abs(anchor[6] + norm * share - 1.0) <= detector.norm_error  # (3)
-        and head.norm_square + rest.norm_square - norm * norm * share <= detector.norm_variance  # (4)
-        and _is_within(detector, rest, 0, share)  # (1)
-        and _is_within(detector, rest, 1, share)  # (2)
-    )
-    if not static:
-        return _bias_agrees(detector, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    gx = (head.signals[0] + rest.signals[0]) * share
-    gy = (head.signals[1] + rest.signals[1]) * share
-    gz = (head.signals[2] + rest.signals[2]) * share
-    ax = anchor[3] + (head.signals[3] + rest.signals[3]) * share
-    ay = anchor[4] + (head.signals[4] + rest.signals[4]) * share
-    az = anchor[5] + (head.signals[5] + rest.signals[5]) * share
-    window = n if _rate_is_steady(detector, tail, n, gx, gy, gz) else 0  # (6)
-    return _bias_agrees(detector, window, anchor[0] + gx, anchor[1] + gy, anchor[2] + gz, ax, ay, az)
+            tail[at, 0], tail[at, 1], tail[at, 2] = head[0], head[1], head[2]
+        return -1 if state.moves or not state.has_block or state.samples <= state.moves_until else state.samples
+    # The block is full and is the window: sum it up backwards, begin the next.
+    if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
+        for m in range(SIGNALS):
+            anchor[m] = block[at, m]
+    for m in range(SUMS):
+        head[m] = 0.0
+    _add(tail[at], head, block, at, anchor)
+    state.moves, state.moves_until, state.samples, state.has_block = False, -1, 0, True
+    for before in range(at - 1, -1, -1):
+        if _is_far(state, model, before):
+            state.moves_until = before
+            return -1
+        _add(tail[before], tail[before + 1], block, before, anchor)
+    return 0
 
 
 @kernel
-def _run(detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    detector = detectors[0]
+def _run(states, models, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+    state, model = states[0], models[0]
+    window, anchor, limits, share = state.window, state.anchor, model.limits, 1.0 / len(state.block)
     for k in range(len(gyro_S)):
+        static[k] = False
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
-        ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        static[k] = _step(detector, block, tail, gx, gy, gz, ax, ay, az)
+        first = _add_sample(state, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2])
+        state.bias_var += model.walk_var
+        if first >= 0:
+            for m in range(SUMS):
+                window[m] = state.head[m] + state.tail[first, m]
+            norm = window[6] * share
+            if (
+                abs(anchor[6] + norm - 1.0) <= model.norm_error  # (3)
+                and window[19] - window[6] * norm <= model.norm_variance  # (4)
+                and _is_within(window, limits[0], 0, share)  # (1)
+                and _is_within(window, limits[1], 1, share)  # (2)
+                and _rate_is_steady(state, model)  # (6)
+            ):
+                static[k] = _bias_agrees(state, model)  # (5)
+                continue
+        state.average_rate -= model.fade * state.average_rate
