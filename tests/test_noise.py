@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadPhase
-from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, WINDOW_S, estimate_noise, find_static_window
+from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, estimate_noise
+from wepose_pin.filters.phases import WINDOW_S, find_static_window
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 
 RATE = 100.0

@@ -10,7 +10,6 @@ import numpy as np
 from .. import rotations
 from ..compilation import compiled
 from ..errors import BadData, BadPhase
-from ..recording import ImuSensor, Recording
 
 # Smallest standard deviations: a quantised signal may be constant, but no MEMS sensor is more precise, and the
 # covariances stay invertible.
@@ -33,10 +32,6 @@ LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks beyon
 
 ACCEL_BIAS_STD = 0.003  # [rad] tilt error from the bias of a calibrated MEMS accelerometer (3 mg: our assumption)
 MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
-
-# Without stated phases the most static window of this length in the beginning is used.
-WINDOW_S = 2.0
-BEGINNING_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -86,25 +81,26 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     BadPhase
         Fewer than 10 samples, or accel without gravity.
     """
-    if len(gyro_S) < 10:
-        raise BadPhase(f"the static phase holds {len(gyro_S)} samples; at least 10 are needed to measure noise")
+    n = len(gyro_S)
+    if n < 10:
+        raise BadPhase(f"the static phase holds {n} samples; at least 10 are needed to measure noise")
     gravity = float(np.linalg.norm(accel_S, axis=1).mean())
     if not gravity > 0.0:
         raise BadPhase(
             "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up when static"
         )
-    gyro_cov, half_second_cov = _compute_cov(gyro_S), _compute_half_second_cov(gyro_S, rate_hz)
+    size = max(1, round(BLOCK_S * rate_hz))
+    blocks, gyro_cov = n // size, _compute_cov(gyro_S)
+    # Means of blocks average white noise out and keep sway; less than four show none.
+    half_second_cov = _compute_cov(average_blocks(gyro_S, size)) if blocks >= 4 else None
+    bias_cov = gyro_cov / n if half_second_cov is None or worn else half_second_cov / blocks
+    bias_cov = _apply_floor(bias_cov, BIAS_FLOOR)
     if worn:  # what sways comes back: its mean is smaller than that of independent blocks
-        half_second_cov = _estimate_sway_cov(gyro_S, rate_hz, half_second_cov)
-        allowed = min(1.0, 2.0 / (SWAY_RATE * len(gyro_S) / rate_hz) ** 2)
-        bias_cov = _apply_floor(gyro_cov / len(gyro_S), BIAS_FLOOR)
+        half_second_cov = _estimate_sway_cov(gyro_S, size, half_second_cov)
+        allowed = min(1.0, 2.0 / (SWAY_RATE * n / rate_hz) ** 2)
         bias_cov = bias_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
-    elif half_second_cov is None:  # too short for sway: the white part alone
-        bias_cov = _apply_floor(gyro_cov / len(gyro_S), BIAS_FLOOR)
-    else:  # the means of blocks average white noise out and keep sway
-        bias_cov = _apply_floor(half_second_cov / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
     return SensorNoise(
-        gyro_bias=average_blocks(gyro_S, len(gyro_S))[0],
+        gyro_bias=average_blocks(gyro_S, n)[0],
         gyro_bias_cov=bias_cov,
         gyro_cov=_apply_floor(gyro_cov, GYRO_FLOOR),
         accel_cov=_apply_floor(_compute_cov(accel_S / gravity), ACCEL_FLOOR),
@@ -114,8 +110,8 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     )
 
 
-def _estimate_sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray | None) -> np.ndarray:
-    """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's half-second means by sway.
+def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray | None) -> np.ndarray:
+    """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's means over blocks of `size` samples by sway.
 
     It is the `measured` one with `SWAY_RATE_STD` as a prior of `PRIOR_BLOCKS` blocks, or without the prior where the
     means vary like white noise. A phase of less than two seconds gives no estimate (half a sway looks like a steady
@@ -123,11 +119,10 @@ def _estimate_sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray 
     """
     if measured is None:
         return SWAY_RATE_STD**2 * np.eye(3)
-    half_second = max(1, round(BLOCK_S * rate_hz))
-    white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / half_second
+    white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / size
     excess = float(np.trace(measured)) / 3.0 - white
     prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
-    degrees = len(gyro_S) // half_second - 1
+    degrees = len(gyro_S) // size - 1
     return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
 
 
@@ -150,12 +145,6 @@ def _average_blocks(values, size):  # type: ignore[no-untyped-def]
             for axis in range(3):
                 means[block, axis] += values[k, axis]
     return means / size
-
-
-def _compute_half_second_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:
-    """Compute the covariance of the means of blocks; None with fewer than four blocks."""
-    size = max(1, round(BLOCK_S * rate_hz))
-    return _compute_cov(average_blocks(gyro_S, size)) if len(gyro_S) // size >= 4 else None
 
 
 def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
@@ -199,48 +188,3 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
     else:  # too short for sway to average out
         variance = float(across.var(axis=0).sum()) / 2.0
     return StartTilt(rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))
-
-
-def find_static_window(recording: Recording) -> tuple[float, float]:
-    """Find the interval [s] of `WINDOW_S` in the first `BEGINNING_S` in which all sensors measure and move least.
-
-    A steady rotation about the vertical has no variance: the mean rate that all sensors share counts as motion.
-
-    Raises
-    ------
-    BadPhase
-        Every window has a lost sensor.
-    """
-    time, rate_hz = recording.time, recording.rate_hz
-    n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
-    window = min(max(round(WINDOW_S * rate_hz), 10), n)
-    stride = max(1, window // 40)  # the windows need not begin at every sample
-    motion = np.zeros(len(range(0, n - window + 1, stride)))
-    vertical_rate = np.zeros((0, len(motion)))
-    for sensor in recording.sensors.values():
-        if isinstance(sensor, ImuSensor):
-            signal = sensor.gyro_S[:n]
-        else:
-            # 2 (q[k] − q[k−1]) is the rotation between samples, with the signs made to agree.
-            quat = sensor.quat_VS[:n]
-            flips = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))[:, None]
-            signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
-        windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)[::stride]
-        motion += windows.var(axis=-1).sum(axis=-1)
-        if isinstance(sensor, ImuSensor):
-            up = np.lib.stride_tricks.sliding_window_view(sensor.accel_S[:n], window, axis=0)[::stride].mean(axis=-1)
-            rate = np.einsum("ni,ni->n", windows.mean(axis=-1), up) / np.linalg.norm(up, axis=1)
-            vertical_rate = np.vstack([vertical_rate, rate])
-        if sensor.gap is not None:  # a bridge has no motion
-            motion[np.lib.stride_tricks.sliding_window_view(sensor.gap[:n], window)[::stride].any(axis=-1)] = np.inf
-    if len(vertical_rate):
-        motion += len(vertical_rate) * vertical_rate.mean(axis=0) ** 2
-    if not np.isfinite(motion).any():
-        lost = [name for name, sensor in recording.sensors.items() if sensor.gap is not None and sensor.gap[:n].any()]
-        raise BadPhase(
-            f"{recording.where()}: no {WINDOW_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
-            f"{', '.join(f'sensors.{name}' for name in lost)} are lost there; take them out, or name the start pose, "
-            f"[phases] start = [[from, to]]"
-        )
-    first = int(np.argmin(motion)) * stride
-    return float(time[first]), float(time[first + window - 1])

@@ -14,22 +14,23 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, WeposeError
 from ..recording import ImuSensor, OrientationSensor, Recording, format_span, format_time
 from ..recording.sensors import compute_rate
-from .noise import SensorNoise, estimate_noise, find_static_window
+from .noise import SensorNoise, estimate_noise
 
 # Motion in the start pose: root mean square of the rate, and largest rotation from the mean. A standing person sways
 # below 3 deg/s and 3 deg. Above `MOVES` the mean pose is not the start pose; above `SWAYS` it is a warning.
 MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
 SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
 # All sensors rotate about the vertical at one rate when the person rotates: a mean rate [rad/s] above `COMMON_RATE`
-# with a probability by chance below `COMMON_RATE_CHANCE`. With one or two sensors the limit is above any bias in data
-# sheets.
-COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
-LARGEST_BIAS = float(np.deg2rad(5.0))
-
+# with a probability by chance below `COMMON_RATE_CHANCE`, in three sensors or more.
+COMMON_RATE, COMMON_RATE_CHANCE, FEWEST_SENSORS = float(np.deg2rad(0.5)), 1e-3, 3
 
 # Where a sensor turns faster than `SWAYS_DEG_S` over `BLOCK_S`, it moves; a tremor averages out over so long.
 BLOCK_S = 0.2
 LEAST_STATIC_S = 1.0  # of an interval with motion in it, that must be static
+
+# Without stated phases the most static window of this length in the beginning is used.
+WINDOW_S = 2.0
+BEGINNING_S = 20.0
 
 # Samples of a static phase, and the share of them that each sensor must have measured.
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
@@ -78,21 +79,18 @@ def _find_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float
     diagnostics = list(recording.diagnostics)
     stated, static = recording.phases.get("start", ()), recording.phases.get("static", ())
     is_guessed = not stated or recording.start_is_guessed
-    if stated:
-        start = stated[0]
-    elif static:
+    if static and not stated:
         raise BadPhase(
             f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
             f"start = [[from, to]]"
         )
-    else:
-        start = find_static_window(recording)
-    if len(stated) > 1:
-        diagnostics.append(_report_ignored_intervals("start", start))
+    start = stated[0] if stated else find_static_window(recording)
+    for phase, intervals in (("start", stated), ("static", static)):
+        if len(intervals) > 1:
+            facts = {"start": intervals[0][0], "end": intervals[0][1]}
+            diagnostics.append(Diagnostic("phase-intervals-ignored", WARNING, phase, facts=facts))
     if is_guessed:
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
-    if len(static) > 1:
-        diagnostics.append(_report_ignored_intervals("static", static[0]))
     for name, interval in (("start", start), *(("static", span) for span in static[:1])):
         place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
         samples = len(recording.time[recording.span(interval)])
@@ -178,10 +176,6 @@ def _compute_block_rates(recording: Recording, segment: str, firsts: np.ndarray,
     return np.degrees(np.linalg.norm(means - np.nanmedian(means, axis=0), axis=1))
 
 
-def _report_ignored_intervals(phase: str, first: tuple[float, float]) -> Diagnostic:
-    return Diagnostic("phase-intervals-ignored", WARNING, phase, facts={"start": first[0], "end": first[1]})
-
-
 def check_common_rotation(
     recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]
 ) -> list[Diagnostic]:
@@ -201,14 +195,10 @@ def check_common_rotation(
         mean_S = accel_S[recording.find_measured(segment, interval)].mean(axis=0)
         up_S[segment] = mean_S / np.linalg.norm(mean_S)
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
-    if len(rates) == 0:
+    if len(rates) < FEWEST_SENSORS:
         return []
-    mean, limit = float(rates.mean()), COMMON_RATE if len(rates) >= 3 else LARGEST_BIAS
-    turns = abs(mean) > limit
-    if len(rates) >= 3:
-        spread = max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
-        turns = turns and 2.0 * stdtr(len(rates) - 1, -abs(mean) / spread) < COMMON_RATE_CHANCE
-    if not turns:
+    mean, error = float(rates.mean()), max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
+    if abs(mean) < COMMON_RATE or 2.0 * stdtr(len(rates) - 1, -abs(mean) / error) > COMMON_RATE_CHANCE:
         return []
     turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
     if turn_deg > MOVES_DEG:
@@ -221,7 +211,7 @@ def check_common_rotation(
         up = up_S[segment]
         noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
     facts: dict[str, float | str] = {"variant": "rotates", "rotation": float(np.deg2rad(turn_deg))}
-    return [Diagnostic("start-pose-motion", WARNING, value=abs(mean), limit=limit, facts=facts)]
+    return [Diagnostic("start-pose-motion", WARNING, value=abs(mean), limit=COMMON_RATE, facts=facts)]
 
 
 def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[Diagnostic]:
@@ -262,3 +252,43 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
         limit = float(np.deg2rad(SWAYS_DEG_S))
         return [Diagnostic("start-pose-motion", WARNING, segment, float(np.deg2rad(rms)), limit, facts)]
     return []
+
+
+def find_static_window(recording: Recording) -> tuple[float, float]:
+    """Find the interval [s] of `WINDOW_S` in the first `BEGINNING_S` in which all sensors measure and move least.
+
+    A steady rotation about the vertical has no variance: the mean rate that all sensors share counts as motion.
+
+    Raises
+    ------
+    BadPhase
+        Every window has a lost sensor.
+    """
+    time, rate_hz = recording.time, recording.rate_hz
+    n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))
+    window = min(max(round(WINDOW_S * rate_hz), 10), n)
+    stride = max(1, window // 40)  # the windows need not begin at every sample
+
+    def slide(values: np.ndarray) -> np.ndarray:
+        return np.lib.stride_tricks.sliding_window_view(values[:n], window, axis=0)[::stride]
+
+    motion, vertical_rates = np.zeros(len(range(0, n - window + 1, stride))), []
+    for sensor in recording.sensors.values():
+        rates = slide(compute_rate(sensor.part(slice(n)), rate_hz))
+        motion += rates.var(axis=-1).sum(axis=-1)
+        if isinstance(sensor, ImuSensor):
+            up = slide(sensor.accel_S).mean(axis=-1)
+            vertical_rates.append(np.einsum("ni,ni->n", rates.mean(axis=-1), up) / np.linalg.norm(up, axis=1))
+        if sensor.gap is not None:  # a bridge has no motion
+            motion[slide(sensor.gap).any(axis=-1)] = np.inf
+    if vertical_rates:
+        motion += len(vertical_rates) * np.mean(vertical_rates, axis=0) ** 2
+    if not np.isfinite(motion).any():
+        lost = [name for name, sensor in recording.sensors.items() if sensor.gap is not None and sensor.gap[:n].any()]
+        raise BadPhase(
+            f"{recording.where()}: no {WINDOW_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
+            f"{', '.join(f'sensors.{name}' for name in lost)} are lost there; take them out, or name the start pose, "
+            f"[phases] start = [[from, to]]"
+        )
+    first = int(np.argmin(motion)) * stride
+    return float(time[first]), float(time[first + window - 1])

@@ -14,7 +14,7 @@ from ..diagnostics import Diagnostic, notebook_html
 from ..errors import BadData, BadOption, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
 from .amekf import Amekf, AmekfParams
-from .base import FilterRun, make_run, run_in_parallel
+from .base import FilterRun, OrientationFilter, make_run, run_in_parallel
 from .complementary import Gdc, Ncf
 from .noise import MOVING_TILT_STD, SensorNoise, StartTilt, estimate_start_tilt
 from .phases import find_reference_phases
@@ -23,7 +23,7 @@ from .smekf import Smekf, SmekfParams
 from .smoother import Smoother
 from .static import USUAL_TEST, StaticDetector, StaticTest
 
-METHODS: dict[str, type] = {
+METHODS: dict[str, type[OrientationFilter]] = {
     "amekf": Amekf,
     "smoother": Smoother,
     "smekf": Smekf,
@@ -34,7 +34,6 @@ METHODS: dict[str, type] = {
 BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
 STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
-_PARAMS: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
 
 
 class Orientation(NamedTuple):
@@ -62,15 +61,11 @@ class Orientation(NamedTuple):
     diagnostics: tuple[Diagnostic, ...] = ()
     about_vertical: np.ndarray | None = None
 
-    @property
-    def rows(self) -> FilterRun:
-        """What the filter gives of each sample."""
-        return FilterRun(self.quat_VS, self.gyro_bias, self.attitude_cov, self.about_vertical)
-
     def take(self, rows: slice | np.ndarray) -> Orientation:
         """Take the samples `rows`."""
-        taken = dict(zip(FilterRun._fields, self.rows.part(rows), strict=True))
-        return self._replace(static=self.static[rows], **taken)  # type: ignore[arg-type]
+        columns = ((name, getattr(self, name)) for name in _SAMPLED)
+        taken: dict[str, Any] = {name: None if each is None else each[rows] for name, each in columns}
+        return self._replace(**taken)
 
     def __repr__(self) -> str:
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
@@ -81,22 +76,22 @@ class Orientation(NamedTuple):
         return notebook_html(self, self.diagnostics)
 
 
+_SAMPLED = ("static", *FilterRun._fields)  # what an `Orientation` has of each sample
+
+
 def join_orientations(parts: Sequence[Orientation]) -> Orientation:
     """Join the samples of one sensor's orientations; what is not of each sample is that of the last part."""
-    columns = zip(*(part.rows for part in parts), strict=True)
-    joined = [None if column[0] is None else np.concatenate(column) for column in columns]
-    static = np.concatenate([part.static for part in parts])
-    return parts[-1]._replace(static=static, **dict(zip(FilterRun._fields, joined, strict=True)))  # type: ignore[arg-type]
+    columns = {name: [getattr(part, name) for part in parts] for name in _SAMPLED}
+    joined: dict[str, Any] = {k: None if each[0] is None else np.concatenate(each) for k, each in columns.items()}
+    return parts[-1]._replace(**joined)
+
+
+def _describe(run: FilterRun, static: np.ndarray, noise: SensorNoise) -> Orientation:
+    return Orientation(run.quat_VS, run.gyro_bias, static, run.attitude_cov, noise, (), run.about_vertical)
 
 
 def check_method(method: str) -> str:
-    """Check that a method of that name exists, and return it.
-
-    Raises
-    ------
-    BadOption
-        It does not.
-    """
+    """Return the method, or raise `BadOption` where there is none of that name."""
     if method not in METHODS:
         raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
     return method
@@ -164,9 +159,9 @@ class SensorFilters:
             self.quat_VS, self.gyro_bias, self.attitude_cov, self.about_vertical = self._now
             self._rows = [slice(i, i + 1) for i in range(k)]
         for i, each in enumerate(orientations):
-            for now, values in zip(self._now, each.rows, strict=True):
-                if now is not None and values is not None and len(values):
-                    now[i] = values[-1]
+            for now, name in zip(self._now, FilterRun._fields, strict=True):
+                if now is not None and len(each.quat_VS):
+                    now[i] = getattr(each, name)[-1]
         return dict(zip(self.names, orientations, strict=True))
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
@@ -192,26 +187,23 @@ class SensorFilters:
         if before is None or self._method in OFFLINE:
             static = detector.run(gyro_S, accel_S)
             run = filter_.run(gyro_S, accel_S, static)
-            if before is not None:
+            if before is not None and run.attitude_cov is not None:
                 # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
-                run.attitude_cov[: len(before[1])] = before[0].attitude_cov
-        else:
-            backward, static_before = before
-            rest = slice(len(static_before), None)
-            static = np.concatenate([static_before, detector.run(gyro_S[rest], accel_S[rest])])
-            run = make_run(len(gyro_S), covariance=filter_.has_covariance)
-            for values, earlier in zip(run, backward, strict=True):
-                if values is not None and earlier is not None:
-                    values[: len(earlier)] = earlier
-            filter_.run(gyro_S[rest], accel_S[rest], static[rest], run.part(rest))
-        quat_VS, gyro_bias, attitude_cov, about_vertical = run
-        noise = self._noises[name]
-        return Orientation(quat_VS, gyro_bias, static, attitude_cov, noise, about_vertical=about_vertical)
+                run.attitude_cov[: len(before.static)] = before.attitude_cov
+            return _describe(run, static, self._noises[name])
+        begin = len(before.static)
+        run, rest = make_run(len(gyro_S), covariance=filter_.has_covariance), slice(begin, None)
+        for field, values in zip(FilterRun._fields, run, strict=True):
+            if values is not None:
+                values[:begin] = getattr(before, field)
+        static = np.concatenate([before.static, detector.run(gyro_S[rest], accel_S[rest])])
+        filter_.run(gyro_S[rest], accel_S[rest], static[rest], run.part(rest))
+        return _describe(run, static, self._noises[name])
 
     def _begin(
         self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float
-    ) -> tuple[FilterRun, np.ndarray] | None:
-        """Create the filter; return the samples before its first one filtered, and whether they are static."""
+    ) -> Orientation | None:
+        """Create the filter; return what lies before its first sample, filtered backward."""
         noise, phase = self._noises[name], self._start or slice(0, self._test.samples(rate_hz))
         start = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
         if self._start is None:  # the sensor may move there
@@ -219,10 +211,9 @@ class SensorFilters:
         first, before = phase.start, None
 
         def create(method: str, noise: SensorNoise, start: StartTilt) -> Any:
-            params = self._params
-            if method in _PARAMS and params is None:
-                params = _PARAMS[method](tilt_std=start.tilt_std, gyro_range=gyro_range)
-            elif method in _PARAMS:
+            params, params_type = self._params, METHODS[method].params_type
+            if params_type in (AmekfParams, SmekfParams):
+                params = params or params_type(tilt_std=start.tilt_std)
                 params = replace(params, gyro_range=min(gyro_range, params.gyro_range))
             return METHODS[method](noise, rate_hz, start.quat_VS, params)
 
@@ -238,7 +229,7 @@ class SensorFilters:
             cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
             # What the backward run has corrected is no correction of the forward run.
             vertical = None if run.about_vertical is None else np.zeros_like(run.about_vertical)
-            before = FilterRun(run.quat_VS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1]
+            before = _describe(FilterRun(run.quat_VS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1], noise)
             if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
                 turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
                 start = StartTilt(rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD)

@@ -18,7 +18,7 @@ from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
-from ..filters.noise import BEGINNING_S
+from ..filters.phases import BEGINNING_S
 from ..recording import Recording
 from .headings import HeadingCorrection
 from .result import TrackResult
