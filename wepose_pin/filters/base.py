@@ -23,9 +23,10 @@ START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so 
 
 # While the gyroscope is lost (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant
 # HOLD_S. While it is lost or saturated, the attitude's standard deviation grows by the motion that may have been
-# missed: after T seconds by LOST_RATE_STD T²/(T + HOLD_S), up to π.
+# missed: after T seconds by LOST_RATE_STD T²/(T + HOLD_S), up to MOST_LOST_STD.
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
+MOST_LOST_STD = 4.0  # [rad] beyond which nothing is known
 
 # Columns of `FilterRun.about_vertical`
 HEADING, RATE, RATE_VAR = range(3)
@@ -143,8 +144,8 @@ def bridge_rate(state, model, gx, gy, gz, bx, by, bz):  # type: ignore[no-untype
     else:
         before, after = state.lost_s, state.lost_s + model.dt
         lost_var = (
-            min(np.pi, LOST_RATE_STD * after * after / (after + HOLD_S)) ** 2
-            - min(np.pi, LOST_RATE_STD * before * before / (before + HOLD_S)) ** 2
+            min(MOST_LOST_STD, LOST_RATE_STD * after * after / (after + HOLD_S)) ** 2
+            - min(MOST_LOST_STD, LOST_RATE_STD * before * before / (before + HOLD_S)) ** 2
         )
         state.lost_s = after
     return x, y, z, is_measured, lost_var
