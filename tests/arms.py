@@ -14,8 +14,7 @@ UPPER, FORE, HAND = 0.30, 0.27, 0.08  # [m] of the person
 
 MAP = """format = 1
 urdf = "arm.urdf"
-base = "{base}"
-up = "{up}"
+{base}up = "{up}"
 forward = "{forward}"
 
 [rest]
@@ -101,7 +100,7 @@ def write_arm(
     named = [name for name in JOINTS if without != f"{name}.acceleration"]
     (folder / "arm.toml").write_text(
         MAP.format(
-            base=base,
+            base=f'base = "{base}"\n' if base else "",
             up=up,
             forward=forward,
             acceleration="\n".join(f"{name} = {acceleration}" for name in named),

@@ -171,7 +171,8 @@ def prepare(line: str, folder: Path) -> str:
             target = (folder / out).resolve()
             (folder / out).unlink()
             subprocess.run(["cp", "-r", str(target), str(folder / out)], check=True)
-    return f"{line} --speed max --no-page" if "live --source replay" in line else line
+    speed = "10" if "--robot" in line else "max"  # a robot follows a multiple of the replay's own speed
+    return f"{line} --speed {speed} --no-page" if "live --source replay" in line else line
 
 
 def complete_session(folder: Path) -> None:
