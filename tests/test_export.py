@@ -293,7 +293,7 @@ def test_bvh_of_one_arm_without_its_forearm(tmp_path: Path) -> None:
     export(write_folder(tmp_path / "r", some), tmp_path / "x.bvh")
     read = pybvh.read_bvh_file(tmp_path / "x.bvh")
     assert read.joint_names == ["Hips", "Spine", "LeftArm", "LeftForeArm", "LeftHand", "RightArm"]
-    with pytest.raises(BadData, match="no orientation of the torso"):
+    with pytest.raises(BadData, match="no orientation of a person's torso"):
         export(write_folder(tmp_path / "s", a_pose(("left_forearm",), n=20)), tmp_path / "y.bvh")
 
 

@@ -17,7 +17,7 @@ from wepose_pin.commands.track import track as track_session
 from wepose_pin.errors import ExistingOutput
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
-from wepose_pin.writers.folder import result_folder
+from wepose_pin.writers.provenance import result_folder
 from wepose_pin.writers.result import write_subject
 
 

@@ -114,8 +114,7 @@ def calibrate(
     from ..readers.mvnx import read_subject
     from ..report import calibration as report_room
     from ..writers.calibration import write_calibration
-    from ..writers.folder import result_folder
-    from ..writers.provenance import collect_provenance
+    from ..writers.provenance import collect_provenance, result_folder
 
     if prior is not None and (stature is not None or sex is not None):
         raise WrongOption(

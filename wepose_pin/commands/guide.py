@@ -72,8 +72,7 @@ def run_guide(
     from ..readers.mvnx import read_subject
     from ..report.calibration import write_calibration_page
     from ..writers.calibration import write_calibration
-    from ..writers.folder import result_folder
-    from ..writers.provenance import collect_provenance
+    from ..writers.provenance import collect_provenance, result_folder
 
     joined = protocol or choose_protocol(source, setup, model)
     later = [load_protocol(part) for part in split_protocol(joined)[1:]]

@@ -95,8 +95,7 @@ def track(
     from ..report.pages import write_track_pages
     from ..report.viewer import MOST_FRAMES
     from ..tracking import CHUNK_S, SummaryAccumulator, TrackOptions, track_chunks
-    from ..writers.folder import result_folder
-    from ..writers.provenance import collect_provenance
+    from ..writers.provenance import collect_provenance, result_folder
     from ..writers.result import write_about, write_poses
 
     chosen = method or BEST

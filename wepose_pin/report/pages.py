@@ -17,8 +17,7 @@ from ..diagnostics import Diagnostic
 from ..documents import whole_file
 from ..tracking import TrackResult, TrackSummary, summarize
 from ..writers import write_result
-from ..writers.folder import result_folder
-from ..writers.provenance import CALL, collect_provenance
+from ..writers.provenance import CALL, collect_provenance, result_folder
 from .page import write_pages
 from .viewer import pose_html
 

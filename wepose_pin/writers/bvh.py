@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
@@ -42,7 +41,7 @@ NAMES = {
         )
     },
 }
-ROOTS = ("Hips", "Root")  # the root of a person, whose orientation is that of the segment of this name; of a mechanism
+ROOT = "Hips"  # whose orientation is that of the segment of this name, else of the reference segment
 SHORT_M, LONG_M = 0.2, 0.3  # [m] of a bone whose end is not known: of a segment without a length, and of others
 
 
@@ -50,7 +49,7 @@ class Bone(NamedTuple):
     """A joint and what hangs on it."""
 
     name: str
-    segment: str | None  # whose orientation it has; None: W's
+    segment: str  # whose orientation it has
     at: np.ndarray  # (3,) [m] in W, in the N-pose
     children: list[Bone]
     end: np.ndarray  # (3,) [m] in W, in the N-pose: where it ends, if it has no children
@@ -59,6 +58,11 @@ class Bone(NamedTuple):
 def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     """Write hierarchy and motion; angles are followed over time, so they may go beyond 180°."""
     check_complete(motion, "a .bvh")
+    table = motion.model.table
+    if table.is_mechanism or table.reference not in motion.pose.quat_WL:
+        raise BadData(
+            f"{motion.where}: no orientation of a person's {table.reference} in pose.parquet; a .bvh ties all to it"
+        )
     motion = resample_evenly(motion)
     root = _build_skeleton(motion)
     columns = [100.0 * _to_file_axes(_compute_root_position(motion, root)), *_compute_angles(motion, root, None)]
@@ -71,21 +75,14 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
 
 
 def _build_skeleton(motion: Motion) -> Bone:
-    """Build the bones that are known: of a person hips, spine, and of each limb as much as has sensors."""
+    """Build the bones that are known: hips, spine, and of each limb as much as has sensors."""
     model, table, measured = motion.model, motion.model.table, motion.pose.quat_WL
-    if not table.is_mechanism and table.reference not in measured:
-        raise BadData(
-            f"{motion.where}: no orientation of the {table.reference} in pose.parquet; a .bvh ties the rest to it"
-        )
-    if table.is_mechanism:
-        q = pin.neutral(model.pin)[None]
-    else:
-        q = solve_configuration(model, {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in measured})
+    q = solve_configuration(model, {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in measured})
     known, count = find_known_points(model, measured), len(table.segments)
     links = [*table.segments, *(model.point_frames[point] for point in known)]
     p_W = compute_link_poses(model, q, links, rotations=False)[1][0]
     starts, points = dict(zip(table.segments, p_W, strict=False)), dict(zip(known, p_W[count:], strict=True))
-    hips = next((segment for segment in table.segments if NAMES.get(segment) == ROOTS[0]), None)
+    hips = next((segment for segment in table.segments if NAMES.get(segment) == ROOT), None)
     anchors = _find_anchors(motion)
 
     def find_end(segment: str, at: np.ndarray, above_at: np.ndarray) -> np.ndarray:
@@ -101,11 +98,11 @@ def _build_skeleton(motion: Motion) -> Bone:
 
     def hang(segment: str, above: str | None, above_at: np.ndarray) -> Bone | None:
         """Hang the bone of a segment; None where it has no sensor and does not lie rigidly between points."""
-        rigid = table.segments[segment].rigid_without_sensor and table.ends(segment) is not None and above is not None
-        if segment not in measured and not rigid:
+        rigid = table.segments[segment].rigid_without_sensor and table.ends(segment) is not None
+        own = segment if segment in measured else above if rigid else None
+        if own is None:
             return None
-        at = np.zeros(3) if segment == table.reference and not table.is_mechanism else starts[segment]
-        own = segment if segment in measured else above
+        at = np.zeros(3) if segment == table.reference else starts[segment]
         below = [s for s, parent in model.parents.items() if parent == segment and s != hips]
         children = [bone for s in below if (bone := hang(s, own, at)) is not None]
         name = NAMES.get(segment) or "".join(word.capitalize() for word in segment.split("_"))
@@ -114,9 +111,7 @@ def _build_skeleton(motion: Motion) -> Bone:
     zero = np.zeros(3)
     on_hips = [s for s, parent in model.parents.items() if parent is None or parent == hips]
     bones = [bone for s in on_hips if s != hips and (bone := hang(s, None, zero)) is not None]
-    if table.is_mechanism:
-        return Bone(ROOTS[1], None, zero, bones, zero)
-    return Bone(ROOTS[0], hips if hips in measured else table.reference, zero, bones, bones[0].end)
+    return Bone(ROOT, hips if hips is not None and hips in measured else table.reference, zero, bones, bones[0].end)
 
 
 def _find_anchors(motion: Motion) -> tuple[str, ...]:
@@ -136,7 +131,7 @@ def _compute_root_position(motion: Motion, root: Bone) -> np.ndarray:
     The shoulders without their motion on the torso, which does not lift the hips.
     """
     pose, model, anchors = motion.pose, motion.model, _find_anchors(motion)
-    if root.segment is None or not anchors:
+    if not anchors:
         return np.zeros((len(pose.time), 3))
     if lost := [point for point in anchors if point not in pose.points]:
         raise BadData(f"{motion.where}: no columns {lost[0]}_x … in pose.parquet; a .bvh needs {' and '.join(anchors)}")
@@ -153,14 +148,7 @@ def _compute_root_position(motion: Motion, root: Bone) -> np.ndarray:
 
 def _compute_angles(motion: Motion, bone: Bone, above: np.ndarray | None) -> Iterator[np.ndarray]:
     """Compute the angles (n, 3) [deg] about z, x, y of each bone, in the order of the hierarchy."""
-    model = motion.model
-    if bone.segment is None:
-        quat_WL = np.tile([0.0, 0.0, 0.0, 1.0], (len(motion.pose.time), 1))
-    else:
-        quat_WL = motion.pose.quat_WL[bone.segment]
-        if model.table.is_mechanism:  # whose segments are not W's while the file's angles are zero
-            R_WL, _ = compute_link_poses(model, pin.neutral(model.pin)[None], [bone.segment])
-            quat_WL = multiply(quat_WL, conjugate(Rotation.from_matrix(R_WL[0, 0]).as_quat()))
+    quat_WL = motion.pose.quat_WL[bone.segment]
     quat = quat_WL if above is None else multiply(conjugate(above), quat_WL)
     turned = np.column_stack([_to_file_axes(quat[:, :3]), quat[:, 3]])
     yield np.degrees(euler.follow(euler.decompose(turned, "ZXY"), "ZXY", NEAR_LOCK))

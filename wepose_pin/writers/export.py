@@ -23,7 +23,6 @@ from ..recording import select_interval
 from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
-from .folder import data_folder
 from .joint_motion import (
     ROBOT_URDF,
     TRAJECTORY,
@@ -35,7 +34,7 @@ from .joint_motion import (
 from .lerobot import write_lerobot
 from .motion import Motion, check_rate, resample
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
-from .provenance import provenance_text, write_provenance
+from .provenance import data_folder, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result, write_table
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
@@ -243,7 +242,7 @@ def export(
             partial = files.enter_context(whole_file(file, force))
             if provenance is not None:
                 beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
-                beside.write_text(provenance_text(provenance), encoding="utf-8")
+                write_provenance(beside.parent, provenance, beside.name)
         if kind.of == BODY:
             return Exported(name, kind.write(partial, results[0]) or [])
         motions = [_read_motion(each, name, interval, phase, rate_hz) for each in results]

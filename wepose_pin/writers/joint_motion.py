@@ -30,6 +30,7 @@ from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
 REPETITIONS = "repetitions"  # in the summary of a trajectory, and as the name of what makes episodes
+_ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,6 @@ class JointMotion:
     phases : of the recording; `REPETITIONS` among them are the repetitions of the movement
     begin : the first sample after the robot's approach
     source : name of the recording that a robot follows
-    no_repetitions : why the recording has none
     """
 
     name: str
@@ -68,7 +68,6 @@ class JointMotion:
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     begin: int = 0
     source: str = ""
-    no_repetitions: str = ""
 
     @property
     def rate_hz(self) -> float:
@@ -79,14 +78,10 @@ class JointMotion:
     def ordered(self) -> tuple[Any, ...]:
         """The URDF's joints depth first, in the order of the file, as MuJoCo numbers them."""
         below = parse_tree(self.robot, self.where).below
-        order: list[Any] = []
-
-        def visit(link: str) -> None:
-            for joint in below[link]:
-                order.append(joint)
-                visit(joint.child)
-
-        visit(self.root)
+        order, open_joints = list[Any](), list(reversed(below[self.root]))
+        while open_joints:
+            order.append(open_joints.pop())
+            open_joints += reversed(below[order[-1].child])
         return tuple(order)
 
     @cached_property
@@ -101,16 +96,14 @@ class JointMotion:
 
     def values(self, joint: str) -> np.ndarray:
         """Return the positions (n,) of a joint [rad or m]."""
-        return self._column(joint, self.position, self.posture.get(joint, 0.0))
+        if joint in self.joints:
+            return np.asarray(self.position[:, self.joints.index(joint)])
+        return np.full(len(self.time), self.posture.get(joint, 0.0))
 
     def rates(self, joint: str) -> np.ndarray:
         """Return the velocities (n,) of a joint [rad/s or m/s]."""
-        return self._column(joint, self.velocity, 0.0)
-
-    def _column(self, joint: str, table: np.ndarray, otherwise: float) -> np.ndarray:
-        if joint in self.joints:
-            return np.asarray(table[:, self.joints.index(joint)])
-        return np.full(len(self.time), otherwise)
+        moves = joint in self.joints
+        return np.asarray(self.velocity[:, self.joints.index(joint)]) if moves else np.zeros(len(self.time))
 
     def samples(self, interval: tuple[float, float]) -> slice:
         """Return the samples after the approach that follow an interval [s] of the recording."""
@@ -140,9 +133,6 @@ class JointMotion:
         if len(part.time) < 2:
             raise BadData(f"{self.where}: follows no {selected[0]:g} to {selected[1]:g} s of the recording")
         return part
-
-
-_ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 
 @runtime_checkable
@@ -176,12 +166,11 @@ def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
             if joint.mimic is not None:
                 source, factor, offset = joint.mimic.joint, joint.mimic.multiplier or 1.0, joint.mimic.offset or 0.0
             along = (factor * motion.values(source) + offset)[:, None] * joint_axis(joint)
+            quat, p = np.repeat(quat, len(along), axis=0), np.repeat(p, len(along), axis=0)
             if joint.type == "prismatic":
                 p = p + along @ origin[:3, :3].T
-                quat = np.repeat(quat, len(p), axis=0)
             else:
-                quat = multiply(np.repeat(quat, len(along), axis=0), Rotation.from_rotvec(along).as_quat())
-                p = np.repeat(p, len(quat), axis=0)
+                quat = multiply(quat, Rotation.from_rotvec(along).as_quat())
         transforms[joint.child] = LinkTransform(joint.parent, quat, p)
     return transforms
 
@@ -218,8 +207,8 @@ def read_joint_motion(folder: Path) -> JointMotion:
         place = np.array([float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")])
         posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
         approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
-        phases, repetitions = read_phases(summary), summary.get(REPETITIONS) or {}
-        phases[REPETITIONS] = tuple((float(begin), float(end)) for begin, end in repetitions.get("spans", ()))
+        spans = (summary.get(REPETITIONS) or {}).get("spans", ())
+        phases = read_phases(summary) | {REPETITIONS: tuple((float(begin), float(end)) for begin, end in spans)}
     columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
     values = read_columns(read_table(file), columns, str(file), str(file))
     time = values[:, 0]
@@ -244,7 +233,6 @@ def read_joint_motion(folder: Path) -> JointMotion:
         phases=phases,
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
         source=source,
-        no_repetitions=str(repetitions.get("reason") or ""),
     )
 
 
@@ -283,14 +271,13 @@ def convert_person(motion: Motion) -> JointMotion:
     values = compute_joint_values(model.pin, q)
     for child in model.axes:
         values |= _split_triple(model, child, q)
-    names = tuple(values)
-    position = np.stack([values[name] for name in names], axis=1)
+    position = np.stack(list(values.values()), axis=1)
     return JointMotion(
         name=motion.name,
         where=motion.where,
         robot=model.robot,
         urdf=model.urdf(),
-        joints=names,
+        joints=tuple(values),
         time=pose.time,
         position=position,
         velocity=np.gradient(position, pose.time, axis=0),
@@ -303,14 +290,12 @@ def convert_person(motion: Motion) -> JointMotion:
 
 
 def _split_triple(model: BodyModel, child: str, q: np.ndarray) -> dict[str, np.ndarray]:
-    """The angles (n,) [rad] of the three revolute joints that are one spherical joint of the model."""
-    first = model.pin.idx_qs[model.joints[child]]
-    axes = model.axes[child]
-    mirrored = np.linalg.det(axes) < 0.0
-    basis = axes * [[1.0], [1.0], [-1.0 if mirrored else 1.0]]
+    """Compute the angles (n,) [rad] of the three revolute joints that are one spherical joint of the model."""
+    first, axes = model.pin.idx_qs[model.joints[child]], model.axes[child]
+    last = -1.0 if np.linalg.det(axes) < 0.0 else 1.0  # mirrored axes
+    basis = axes * [[1.0], [1.0], [last]]
     # R = exp(a1 q1) exp(a2 q2) exp(a3 q3), in coordinates along the axes Rx Ry Rz.
     quat = np.column_stack([q[:, first : first + 3] @ basis.T, q[:, first + 3]])
-    angles = euler.follow(euler.decompose(quat, "XYZ"), "XYZ", NEAR_LOCK)
+    angles = euler.follow(euler.decompose(quat, "XYZ"), "XYZ", NEAR_LOCK) * [1.0, 1.0, last]
     triple = parse_tree(model.robot, child).path(child)[-3:]
-    signs = (1.0, 1.0, -1.0 if mirrored else 1.0)
-    return {joint.name: sign * angles[:, k] for k, (joint, sign) in enumerate(zip(triple, signs, strict=True))}
+    return {joint.name: angles[:, k] for k, joint in enumerate(triple)}

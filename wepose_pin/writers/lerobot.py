@@ -28,7 +28,6 @@ COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 FILE = Path("chunk-000", "file-000.parquet")
 
-
 # A motion that is one episode, the state (joints,) that follows it, and what the robot does in it.
 Episode = tuple[JointMotion, np.ndarray, str]
 
@@ -117,9 +116,8 @@ def _list_episodes(
         text += f", {by}"
     parts = [part for span in spans if (part := motion.samples(span)).stop - part.start >= 2]
     if not parts:
-        reason = "the trajectory follows none of it" if spans else "it has no such phase"
-        if by == REPETITIONS and not spans:
-            reason = ": ".join(filter(None, ("no repetitions were found in it", motion.no_repetitions)))
+        missing = "no repetitions were found in it" if by == REPETITIONS else "it has no such phase"
+        reason = "the trajectory follows none of it" if spans else missing
         known = [name for name, intervals in motion.phases.items() if intervals and name != by]
         choices = one_of(known, by) if known else "leave --episodes out"
         raise WrongOption("episodes", by, f"{motion.where}: {reason}; {choices}")
@@ -133,16 +131,13 @@ def _list_episodes(
 
 def _check_alike(motions: Sequence[JointMotion]) -> int:
     """Return the whole rate [Hz] that all motions have."""
-
-    def describe(motion: JointMotion) -> str:
-        return f"robot {motion.name}, {motion.rate_hz:g} Hz, joints {', '.join(motion.joints)}"
-
-    first = motions[0]
-    for motion in motions[1:]:
-        if describe(motion) != describe(first):
+    first, *others = motions
+    whats = [f"robot {each.name}, {each.rate_hz:g} Hz, joints {', '.join(each.joints)}" for each in motions]
+    for other, what in zip(others, whats[1:], strict=True):
+        if what != whats[0]:
             raise BadData(
-                f"{motion.where}: {describe(motion)}; a data set has one robot and one rate, and {first.where} is of "
-                f"{describe(first)}; --rate-hz makes one rate of all"
+                f"{other.where}: {what}; a data set has one robot and one rate, and {first.where} is of {whats[0]}; "
+                f"--rate-hz makes one rate of all"
             )
     rate_hz = round(first.rate_hz)
     if not is_even(first.time) or abs(rate_hz - first.rate_hz) > 1e-3:

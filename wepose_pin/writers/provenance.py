@@ -1,4 +1,7 @@
-"""The provenance of a result: the job that made it as data, hashes of its inputs, code, packages and machine."""
+"""The provenance of a result: the job that made it as data, hashes of its inputs, code, packages and machine.
+
+And the folder that is written into, which may hold an earlier result, or the inputs.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,19 @@ import json
 import platform
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from .. import __version__
 from ..assets import asset
-from ..documents import parse_toml
+from ..body.table_file import MODEL_TABLE
+from ..documents import parse_toml, whole_folder
+from ..errors import ExistingOutput
 from ..libraries import check_file, library_errors
-from .result import versions
+from .result import JOINTS, versions
 
 FORMAT = 1
 CALL = "wepose_pin.track"  # in place of a command, of a result that `TrackResult.save` wrote
@@ -132,21 +138,59 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     except (OSError, ValueError):
         return []  # its reader reports what is wrong
     data, sensors, model = content.get("data"), content.get("sensors"), content.get("model")
-    tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]
-    tables = [table for table in tables if isinstance(table, dict)]
-    formats = [name for table in tables if str(name := table.get("format")).endswith(".toml")]
+    tables = [
+        each for each in [data, *(sensors.values() if isinstance(sensors, dict) else ())] if isinstance(each, dict)
+    ]
+    names = [content.get("urdf"), *(table.get("file") for table in tables)]
+    names += [name for table in tables if str(name := table.get("format")).endswith(".toml")]
     # A body of the package is part of the code.
-    bodies = [model] if isinstance(model, str) and (path.parent / model).is_file() else []
-    truths = [data.get("truth")] if truth and isinstance(data, dict) else []
-    names = [*(table.get("file") for table in tables), *formats, *bodies, content.get("urdf"), *truths]
+    names += [model] if isinstance(model, str) and (path.parent / model).is_file() else []
+    names += [data.get("truth")] if truth and isinstance(data, dict) else []
     return sorted({name for name in names if isinstance(name, str) and name})
 
 
-def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
-    """Write ``provenance.json`` into a folder."""
-    (folder / "provenance.json").write_text(provenance_text(provenance), encoding="utf-8")
+def write_provenance(folder: Path, provenance: Mapping[str, Any], name: str = "provenance.json") -> None:
+    """Write a provenance as a file of its own into a folder."""
+    text = json.dumps(provenance, indent=1, ensure_ascii=False)
+    (folder / name).write_text(f"{text}\n", encoding="utf-8")
 
 
-def provenance_text(provenance: Mapping[str, Any]) -> str:
-    """Format a provenance as a file of its own holds it."""
-    return json.dumps(provenance, indent=1, ensure_ascii=False) + "\n"
+# Folders that hold an earlier result, or files of the user ---------------------------------------------------------
+
+
+@contextmanager
+def data_folder(out: Path, force: bool, earlier: Sequence[str]) -> Iterator[Path]:
+    """`whole_folder` of a data set: with `force` files of an earlier one, by their patterns, go; all others stay."""
+    with whole_folder(out, force) as folder:
+        yield folder
+        written = {path.relative_to(folder) for path in folder.rglob("*")}
+    for path in [path for pattern in earlier for path in out.glob(pattern)]:
+        if path.relative_to(out) not in written:
+            path.unlink()
+
+
+@contextmanager
+def result_folder(out: Path, force: bool) -> Iterator[Path]:
+    """`data_folder` of a result; of an earlier result in `out` those files go that would be read with the new one.
+
+    Raises
+    ------
+    ExistingOutput
+        As `whole_folder`; a session in `out` needs a file that would be replaced; a file of the user's would be read
+        with the result.
+    """
+    inputs = {file.resolve() for file in list_files(out, truth=True)} if (out / "session.toml").is_file() else set()
+    stale = [name for name in (MODEL_TABLE, JOINTS) if (out / name).exists()]
+    if stale and not any((out / name).is_file() for name in INSIDE):
+        raise ExistingOutput(
+            f"{out / stale[0]}: is of no earlier result, and would be read with the new one; rename it, or name "
+            f"another folder by -o"
+        )
+    with data_folder(out, force, [name for name in stale if (out / name).resolve() not in inputs]) as folder:
+        yield folder
+        for name in sorted(file.name for file in folder.iterdir()):
+            if (out / name).resolve() in inputs:
+                session = out / "session.toml"
+                raise ExistingOutput(
+                    f"{out / name}: is an input of {session}, and would be replaced; name another folder by -o"
+                )

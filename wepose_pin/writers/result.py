@@ -6,10 +6,12 @@ With a body other than the upper body also ``model.toml``, its table; of a mecha
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import json
 import platform
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -28,7 +30,7 @@ from ..body.subject import Subject, load_subject, subject_toml
 from ..body.table_file import MODEL_TABLE, format_table
 from ..data_tables import open_source, read_columns, read_table
 from ..diagnostics import from_json
-from ..errors import ExistingOutput, MissingFile
+from ..errors import MissingFile
 from ..libraries import library_errors
 from ..recording import Intervals, Mark, select_interval
 from ..tracking import TrackResult, TrackSummary
@@ -55,11 +57,6 @@ def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = 
     """Write ``pose.parquet``, and of a mechanism ``joints.parquet``, of consecutive chunks, one in memory at a time.
 
     With `covariance` they have its entries besides standard deviations.
-
-    Raises
-    ------
-    ExistingOutput
-        They cannot be written: a full disk, say.
     """
     parts: dict[str, list[Path]] = {}
     for tracked in chunks:
@@ -74,9 +71,12 @@ def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = 
         if len(files) == 1:
             files[0].rename(folder / name)
             continue
-        with writing_errors(name), (folder / name).open("wb") as out:
-            sources: list[Any] = [open_source(file) for file in files]
-            pl.scan_parquet(sources).sink_parquet(out, row_group_size=ROW_GROUP)
+        sources: list[Any] = [open_source(file) for file in files]
+        try:
+            with (folder / name).open("wb") as out:
+                pl.scan_parquet(sources).sink_parquet(out, row_group_size=ROW_GROUP)
+        except pl.exceptions.PolarsError as error:  # which has the system's text and no number
+            raise OSError(errno.ENOSPC, str(error).splitlines()[0]) from error
         for file in files:
             file.unlink()
 
@@ -111,25 +111,10 @@ def write_about(
 
 
 def write_table(path: Path, table: pl.DataFrame) -> None:
-    """Write a Parquet file.
-
-    Raises
-    ------
-    ExistingOutput
-        It cannot be written: a full disk, say.
-    """
-    with writing_errors(path.name), path.open("wb") as file:  # polars takes no path that is not in UTF-8
-        table.write_parquet(file)
-
-
-@contextlib.contextmanager
-def writing_errors(name: str) -> Iterator[None]:
-    """Raise `ExistingOutput` where a table of this name cannot be written."""
-    try:
-        yield
-    except (pl.exceptions.PolarsError, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise ExistingOutput(f"{name}: cannot be written: {reason}; nothing was written") from error
+    """Write a Parquet file."""
+    content = io.BytesIO()  # polars takes no path that is not in UTF-8, and has errors of its own for a full disk
+    table.write_parquet(content)
+    path.write_bytes(content.getbuffer())
 
 
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:

@@ -14,10 +14,12 @@ from .result import write_table
 
 def write_session(folder: Path, recording: Recording, truth: Pose | None = None) -> None:
     """``session.toml``, ``recording.parquet`` and, with a truth, ``truth.parquet`` into an existing folder."""
-    table = {"time": recording.time}
+    table, model = {"time": recording.time}, recording.model
+    if Path(model).is_file():
+        model = str(Path(model).absolute())
     lines = [
         f"name = {toml_string(recording.name)}",
-        *([f"model = {toml_string(_name_model(recording.model))}"] if recording.model else []),
+        *([f"model = {toml_string(model)}"] if model else []),
         f"start_pose = {toml_string(recording.start_pose)}",
         *(["remounted = true"] if recording.remounted else []),
         "",
@@ -54,8 +56,3 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     if truth is not None:
         write_table(folder / "truth.parquet", build_pose_table(truth))
     (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _name_model(model: str) -> str:
-    """The body as a session elsewhere names it."""
-    return str(Path(model).absolute()) if Path(model).is_file() else model
