@@ -10,8 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 from bodies import SEGMENTS
-from test_formats import ACCEL, GYRO, RATE, TIME, WXYZ, dot, mat, mt_manager, sto, ximu3
-from test_mvnx import mvnx, turning
+from device_files import ACCEL, GYRO, RATE, TIME, WXYZ, dot, mat, mt_manager, mvnx, sto, turning, ximu3
 
 import wepose_pin as wp
 from wepose_pin.commands import main

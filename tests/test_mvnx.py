@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from bodies import RIGID_SHOULDERS
+from device_files import MVN_SEGMENTS, mvnx, turning
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
@@ -19,51 +20,7 @@ from wepose_pin.errors import BadData, BadSession, MissingFile
 from wepose_pin.readers.mvnx import read_frames, read_mvnx, read_subject
 from wepose_pin.tracking import track
 
-SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
 OURS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
-HEAD = '<mvnx version="{version}"><mvn version="x"/><subject frameRate="{rate}" segmentCount="6">'
-
-
-def mvnx(
-    folder: Path,
-    quat_wxyz: np.ndarray,
-    *,
-    raw: bool = False,
-    version: str = "3",
-    rate: str = "50",
-    index: list[int] | None = None,
-    before: str = "",
-    end: str = "</frames></subject></mvnx>",
-    t_pose: str | None = "1 0 0 0 " * len(SEGMENTS),
-) -> Path:
-    """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z.
-
-    `t_pose`: the orientations in its frame of type tpose; None: it has no such frame.
-    """
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
-    lines += [f'<segment label="{name}" id="{k}"><points/></segment>' for k, name in enumerate(SEGMENTS, 1)]
-    lines += ["</segments><sensors>", '<sensor label="T8"/><sensor label="LeftForeArm"/>', "</sensors><frames>"]
-    poses = {"npose" if version == "2" else "identity": "1 0 0 0 " * len(SEGMENTS)}
-    if t_pose is not None:
-        poses["tpose"] = t_pose
-    lines += [f'<frame type="{pose}"><orientation>{quats}</orientation></frame>' for pose, quats in poses.items()]
-    for k, quats in enumerate(quat_wxyz):
-        number = k if index is None else index[k]
-        lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
-        lines.append(f"<orientation>{' '.join(f'{value:.9f}' for value in quats.ravel())}</orientation>")
-        if raw:
-            lines.append("<sensorAcceleration>0 0 9.81 0 9.81 0</sensorAcceleration>")
-            lines.append(f"<sensorAngularVelocity>{0.1 + 1e-4 * (k % 2)} 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
-        lines.append("</frame>")
-    (folder / "trial.mvnx").write_text("\n".join([*lines, end]), encoding="utf-8")
-    return folder / "trial.mvnx"
-
-
-def turning(n: int = 40) -> np.ndarray:
-    """(n, 6, 4) wxyz: each segment turns about z by its own angle."""
-    angles = np.linspace(0.0, 0.5, n)[:, None] * np.arange(1, len(SEGMENTS) + 1)
-    xyzw = Rotation.from_rotvec(angles.reshape(-1, 1) * [0.0, 0.0, 1.0]).as_quat()
-    return xyzw[:, [3, 0, 1, 2]].reshape(n, len(SEGMENTS), 4)
 
 
 def session(folder: Path, file: str | Path, segments: tuple[str, ...], data: str = "", each: str = "") -> Path:
@@ -340,7 +297,7 @@ def test_a_damaged_file_is_one_line(change: dict[str, str], says: str, tmp_path:
     ],
 )
 def test_a_file_of_another_content_is_one_line(old: str, new: str, says: str, tmp_path: Path) -> None:
-    path = mvnx(tmp_path, np.tile([1.0, 0.0, 0.0, 0.0], (5, len(SEGMENTS), 1)))
+    path = mvnx(tmp_path, np.tile([1.0, 0.0, 0.0, 0.0], (5, len(MVN_SEGMENTS), 1)))
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(BadData, match=says):
         read_mvnx(path)

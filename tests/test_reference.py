@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run
+from device_files import mvnx, turning
 from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
-from test_mvnx import mvnx, turning
 
 from wepose_pin.body.kinematics import Pose, build_pose_table
 from wepose_pin.errors import BadData, WeposeError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_formats import ACCEL, GYRO, TIME, N
+from device_files import ACCEL, GYRO, TIME, N
 from test_info import info
 
 import wepose_pin as wp
@@ -205,3 +205,19 @@ def test_axes_anywhere_in_a_name() -> None:
     assert list(guess_columns(noraxon).sensors) == ["right_forearm"]
     phone = ["Linear Acceleration x", "Linear Acceleration y", "Linear Acceleration z"]
     assert guess_columns([*phone, "gx", "gy", "gz"]).sensors == {}
+
+
+def test_columns_by_their_names() -> None:
+    names = (
+        "Time (s),chest_gyro_x [deg/s],chest_gyro_y [deg/s],chest_gyro_z [deg/s],chest_acc_x,chest_acc_y,chest_acc_z"
+    )
+    guess = guess_columns([*names.split(","), "chest_mag_x", "chest_mag_y", "chest_mag_z", "left_wrist_qw"])
+    assert guess.times == ["Time (s)"]
+    assert guess.units == {"Time (s)": "s", "gyro": "deg/s"}
+    assert list(guess.sensors) == ["torso"]
+    assert guess.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
+    guess = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
+    assert guess.sensors == {"?": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
+    guess = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
+    assert guess.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
+    assert guess_columns(["a", "b", "velocity_x"]).sensors == {}

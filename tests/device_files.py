@@ -1,0 +1,447 @@
+"""Files of devices and programs, each written as its maker writes it, of one known motion.
+
+Tables are as docs/formats.md has them, from files that labs have published; bags are written by rosbags, the XDF by the
+few lines here, from the specification.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+from scipy.spatial.transform import Rotation
+
+N, RATE, G = 400, 100.0, 9.80665
+TIME = np.arange(N) / RATE
+R_WS = Rotation.from_euler("ZYX", np.column_stack([0.8 * np.sin(TIME), 0.5 * np.sin(2 * TIME), 0.3 * TIME]))
+GYRO = np.concatenate([np.zeros((1, 3)), (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE])
+ACCEL = R_WS.inv().apply([0.0, 0.0, G])
+WXYZ = R_WS.as_quat()[:, [3, 0, 1, 2]]
+US0 = 1_700_000_000_000_000  # µs since 1970
+AXES = "XYZ"
+
+
+def rows(columns: list[np.ndarray | list[str]], separator: str = ",", decimal: str = ".") -> str:
+    cells = [[v if isinstance(v, str) else f"{v:.9g}" for v in column] for column in columns]
+    return "".join(separator.join(row).replace(".", decimal) + "\n" for row in zip(*cells, strict=True))
+
+
+def own(values: np.ndarray, path: Path) -> np.ndarray:
+    """With a noise of its own, far below what is compared: no two sensors give the same values."""
+    return values + 1e-7 * np.random.default_rng(list(str(path).encode())).standard_normal(values.shape)
+
+
+def table_text(columns: Sequence[Any], names: Sequence[str], separator: str = ",", decimal: str = ".") -> str:
+    return separator.join(names) + "\n" + rows(list(columns), separator, decimal)
+
+
+PREAMBLE = (
+    "// Start Time: Unknown\n// Update Rate: 100.0Hz\n// Filter Profile: human (46.1)\n// Firmware Version: 4.6.0\n"
+)
+
+
+MT_RAW = [f"{kind}_{axis}" for kind in ("Acc", "Gyr") for axis in "XYZ"]
+
+
+def mt_manager(
+    path: Path, *, separator: str = "\t", decimal: str = ".", preamble: str = PREAMBLE, first: int = 0, raw: bool = True
+) -> Path:
+    matrix = R_WS.as_matrix().transpose(0, 2, 1).reshape(N, 9)  # columns of the matrix one after the other
+    names = ["PacketCounter", "SampleTimeFine", *(MT_RAW if raw else [])]
+    names += [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
+    columns: list[Any] = [[f"{(first + k) % 65536:05d}" for k in range(N)], [""] * N]
+    columns += [*own(ACCEL, path).T, *GYRO.T, *matrix.T] if raw else [*matrix.T]
+    path.write_text(preamble + separator.join(names) + "\n" + rows(columns, separator, decimal), encoding="utf-8")
+    return path
+
+
+def apdm(path: Path) -> Path:
+    """``Format=7``: two sensors, the first without orientation."""
+    first = ["Format=7"]
+    for number, name in (("5718", "Left Wrist"), ("6575", "Chest")):
+        first += [number, "", "", name, *[""] * 10]
+    kinds = "Accelerometer,,,Gyroscope,,,Magnetometer,,,Barometer,Orientation,,,".split(",")
+    axes = [*"XYZXYZXYZ", "", *"SXYZ"]
+    zero = np.zeros(N)
+    gone: list[Any] = [[""] * N] * 4
+    one, other = ([*own(ACCEL, Path(name)).T, *GYRO.T, zero, zero, zero, zero] for name in ("wrist", "chest"))
+    columns: list[Any] = [[str(1550879504438281 + 10_000 * k) for k in range(N)], *one, *gone, *other, *WXYZ.T]
+    head = [first, ["Time", *kinds, *kinds], ["", *axes, *axes]]
+    path.write_text("".join(",".join(line) + "\n" for line in head) + rows(columns))
+    return path
+
+
+def apdm_by_name(path: Path) -> Path:
+    """As before ``Format=7``."""
+    names = [
+        f"Chest/{kind}/{axis}" for kind in ("Acceleration", "Angular Velocity", "Magnetic Field") for axis in "XYZ"
+    ]
+    names += [f"Chest/Orientation/{axis}" for axis in ("Scalar", "X", "Y", "Z")]
+    units = ["s", *["m/s^2"] * 3, *["deg/s"] * 3, *["uT"] * 3, *[""] * 4]
+    head = f"Test Name:,walk,,\nSample Rate:,100,Hz,\n{','.join(['Time', *names])}\n{','.join(units)}\n"
+    magnetic = [np.zeros(N)] * 3
+    path.write_text(head + rows([TIME, *ACCEL.T, *np.degrees(GYRO).T, *magnetic, *WXYZ.T]))
+    return path
+
+
+DOT = (
+    "sep=,\nDeviceTag:,{tag}\nFirmwareVersion:,3.0.0\nAppVersion:,2023.6.0\nSyncStatus:,{sync}\nOutputRate:,100Hz\n"
+    "FilterProfile:,General\nMeasurement Mode:,Custom Mode 5\nStartTime: ,2025-07-11_20:06:00_086 WEST\n"
+    "© Movella Technologies B. V. 2005-2025\n\n"
+)
+
+
+def dot(path: Path, mode: str = "rates", *, tag: str = "left_wrist", sync: str = "Synced", first_us: int = 0) -> Path:
+    fine = [str((first_us + 10000 * k) % 2**32) for k in range(N)]
+    step = np.concatenate([np.zeros((1, 3)), (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()])
+    modes: dict[str, dict[str, np.ndarray]] = {
+        "rates": {
+            "Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ,
+            "Acc_X,Acc_Y,Acc_Z": own(ACCEL, path),
+            "Gyr_X,Gyr_Y,Gyr_Z": np.degrees(GYRO),
+        },
+        "increments": {
+            "dq_W,dq_X,dq_Y,dq_Z": Rotation.from_rotvec(step).as_quat()[:, [3, 0, 1, 2]],
+            "dv[1],dv[2],dv[3]": ACCEL / RATE,
+        },
+        "quaternion": {"Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ, "FreeAcc_X,FreeAcc_Y,FreeAcc_Z": ACCEL},
+        "euler": {"Euler_X,Euler_Y,Euler_Z": np.degrees(R_WS.as_euler("ZYX"))[:, ::-1]},
+    }
+    names = ",".join(["PacketCounter", "SampleTimeFine", *modes[mode], "Status"])
+    columns: list[Any] = [[str(k + 1) for k in range(N)], fine]
+    columns += [*np.column_stack(list(modes[mode].values())).T, ["0"] * N]
+    text = DOT.format(tag=tag, sync=sync) + names + "\n" + rows(columns)
+    path.write_bytes(text.encode("latin-1"))  # the sign © in the encoding of some Windows
+    return path
+
+
+def ximu3(folder: Path, first_us: int = 52100347) -> Path:
+    folder.mkdir()
+    fine = [str(first_us + 10000 * k) for k in range(N)]
+    names = "Timestamp (us),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),"
+    names += "Accelerometer X (g),Accelerometer Y (g),Accelerometer Z (g)\n"
+    (folder / "Inertial.csv").write_text(names + rows([fine, *np.degrees(GYRO).T, *(own(ACCEL, folder) / 9.80665).T]))
+    (folder / "Quaternion.csv").write_text("Timestamp (us),W,X,Y,Z\n" + rows([fine, *WXYZ.T]))
+    return folder
+
+
+def sto(path: Path, kind: str = "Quaternion", labels: tuple[str, ...] = ("torso_imu", "humerus_r_imu")) -> Path:
+    cells = [",".join(f"{value:.9f}" for value in quat) for quat in WXYZ]
+    head = f"DataRate=100.000000\nDataType={kind}\nversion=3\nOpenSimVersion=4.4\nendheader\n"
+    names = "\t".join(["time", *labels]) + "\n"
+    path.write_text(
+        head + names + "".join(f"{t:.6f}" + f"\t{c}" * len(labels) + "\n" for t, c in zip(TIME, cells, strict=True))
+    )
+    return path
+
+
+def hdf5(path: Path, turned: bool = False) -> Path:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values in {"/imu/torso/gyro": GYRO, "/imu/torso/accel": ACCEL, "/q": WXYZ}.items():
+            file[name] = values.T if turned else values
+        file["/clock/time"] = TIME[None] if turned else TIME
+        file["/note"] = "walking"
+    return path
+
+
+def mat(path: Path) -> Path:
+    savemat(path, {"imu": {"torso": {"gyro": GYRO, "accel": ACCEL}}, "clock": {"time": TIME}, "q": WXYZ, "note": "a"})
+    return path
+
+
+def shimmer(path: Path, separator: str = ";", scale: float = 1.0, dates: bool = False) -> Path:
+    names = ["TimestampSync_FormattedUnix" if dates else "Timestamp_Unix"]
+    names += [f"Accel_{kind}_{a}" for kind in ("LN", "WR") for a in AXES] + ["Battery"]
+    names += [f"{kind}_{a}" for kind in ("Gyro", "Mag") for a in AXES]
+    units = [
+        *("yyyy/mm/dd hh:mm:ss.000" if dates else "ms",),
+        *["m/(s^2)"] * 6,
+        "mV",
+        *["deg/s"] * 3,
+        *["local_flux"] * 3,
+    ]
+    stamps = [f"{1e-3 * US0 + 10 * k:.1f}" for k in range(N)]
+    if dates:
+        stamps = [f"2026/03/12 08:00:{0.01 * k:06.3f}" for k in range(N)]
+    noise = own(ACCEL, path)
+    columns = [stamps, *(scale * noise).T, *(noise + 0.1).T, np.full(N, 4100.0), *np.degrees(GYRO).T, *ACCEL.T]
+    head = f'"sep={separator}"\n' + separator.join([*(f"Shimmer_8665_{n}_CAL" for n in names), ""]) + "\n"
+    body = rows(columns, separator).replace("\n", separator + "\n")
+    path.write_text(head + separator.join([*units, ""]) + "\n" + body)
+    return path
+
+
+def noraxon(path: Path, accel: str = "Noraxon MyoMotion-Segments-{}-Acceleration-{} (mG)") -> Path:
+    names, columns = ["time", "Activity", "Marker"], [TIME, ["walk"] * N, [""] * N]
+    for segment in ("Upper spine", "Forearm RT"):
+        names += [f"Noraxon MyoMotion-Segments-{segment}-Gyroscope-{a} (deg/s)" for a in "xyz"]
+        columns += list(np.degrees(GYRO).T)
+        if "Sensor" in accel:
+            names += [
+                f"{segment[:-3]} Accel Sensor {a} RT (mG)" if "RT" in segment else accel.format(segment, a)
+                for a in AXES
+            ]
+        else:
+            names += [accel.format(segment, a) for a in "xyz"]
+        columns += list(1000.0 / G * own(ACCEL, Path(segment)).T)
+        names += [f"Noraxon MyoMotion-Segments-{segment}-Course (deg)"]
+        columns += [np.zeros(N)]
+    path.write_text("Exported by MR3\nSubject: 7\n" + table_text(columns, names))
+    return path
+
+
+def delsys(path: Path, separator: str = ",", decimal: str = ".") -> Path:
+    """Trigno Discover: muscles ten times as often as the IMUs, whose columns end early."""
+    sensors = ("Forearm left (75657)", "Sternum (75758)")
+    channels = ["EMG 1 (mV)", *(f"ACC {a} (G)" for a in AXES), *(f"GYRO {a} (deg/s)" for a in AXES)]
+    head, kinds, columns = [], [], []
+    for sensor in sensors:
+        head += [sensor, *[""] * (2 * len(channels) - 1)]
+        values = [np.zeros(10 * N), *(own(ACCEL, Path(sensor)) / G).T, *np.degrees(GYRO).T]
+        for channel, column in zip(channels, values, strict=True):
+            kinds += [f"{channel.rpartition(' (')[0]} Time Series (s)", channel]
+            filled = [f"{v:.9g}" for v in column] + [""] * (10 * N - len(column))
+            columns += [
+                [f"{k / (10 if len(column) > N else 1) / RATE:.6f}" if v else "" for k, v in enumerate(filled)],
+                filled,
+            ]
+    lines = [
+        "Application:" + separator + "Trigno Discover (2.1.0.7)",
+        "Date/Time:" + separator + "x",
+        "Length:" + separator + "4",
+    ]
+    lines += [
+        f"{separator} ".join(head),
+        separator.join("sensor mode: 609" if c else "" for c in head),
+        f"{separator} ".join(kinds),
+    ]
+    lines += [separator.join([""] + ["1000 Hz" if k % 2 else "" for k in range(1, len(kinds))])] * 2
+    path.write_text("\n".join(lines) + "\n" + rows(columns, separator, decimal))
+    return path
+
+
+def emgworks(path: Path) -> Path:
+    names: list[str] = []
+    columns: list[Any] = []
+    for kind, unit, values in (("Acc", "g", ACCEL / G), ("Gyro", "deg/sec", np.degrees(GYRO))):
+        for k, a in enumerate(AXES):
+            names += ["X[s]", f"Trigno IM sensor 1: {kind} 1.{a} (IM) [{unit}]"]
+            columns += [TIME, values[:, k]]
+    path.write_text(table_text(columns, names))
+    return path
+
+
+def emgworks_with_labels(path: Path) -> Path:
+    """Units in a line for each channel, before the names; as emgio describes it."""
+    names = [f"{kind}1.{a}" for kind in ("ACC", "GYRO") for a in AXES]
+    lines = [f"Label: {n}  Sampling frequency: 100 Unit: {'g' if 'ACC' in n else 'deg/s'}  Domain: Time" for n in names]
+    columns = [column for values in (ACCEL / G, np.degrees(GYRO)) for v in values.T for column in (TIME, v)]
+    path.write_text(
+        "\n".join(lines) + "\n\n" + table_text(columns, [x for name in names for x in ("X[s]", f'"{name}"')])
+    )
+    return path
+
+
+def sensor_logger(folder: Path, platform: str = "android", late: float = 0.0, gravity: bool = False) -> Path:
+    folder.mkdir(parents=True)
+    stamps = [str(1000 * US0 + 10_000_000 * k) for k in range(N)]
+    after = [str(1000 * US0 + 10_000_000 * k + round(1e9 * late)) for k in range(N)]
+    sign = -1.0 if platform == "ios" else 1.0
+    names = ["time", "seconds_elapsed"]
+    (folder / "Gyroscope.csv").write_text(table_text([stamps, TIME, *GYRO[:, ::-1].T], [*names, *"zyx"]))
+    total = own(ACCEL, folder)
+    accel = {"TotalAcceleration": total, "Accelerometer": 0.3 * total}
+    if gravity:
+        accel = {"Accelerometer": 0.3 * total, "Gravity": 0.7 * total}
+    for name, values in accel.items():
+        (folder / f"{name}.csv").write_text(table_text([after, TIME, *sign * values[:, ::-1].T], [*names, *"zyx"]))
+    quat = table_text(
+        [stamps, TIME, *WXYZ[:, ::-1].T, TIME, TIME, TIME], [*names, "qz", "qy", "qx", "qw", "roll", "pitch", "yaw"]
+    )
+    (folder / "Orientation.csv").write_text(quat)
+    about = f"version,device name,platform,standardisation\n3,phone,{platform},false\n"
+    (folder / "Metadata.csv").write_text(about)
+    return folder
+
+
+def phyphox(folder: Path, separator: str = ",", decimal: str = ".", gyro: str = "Gyroscope {} (rad/s)") -> Path:
+    folder.mkdir(parents=True)
+    scale = 180.0 / np.pi if "deg" in gyro else 1.0
+    sensors = {"Accelerometer": ("Acceleration {} (m/s^2)", ACCEL), "Gyroscope": (gyro, scale * GYRO)}
+    for name, (column, values) in sensors.items():
+        names = ["Time (s)", *(column.format(a) for a in "xyz")]
+        (folder / f"{name}.csv").write_text(table_text([TIME, *values.T], names, separator, decimal))
+    (folder / "Linear Acceleration.csv").write_text("Time (s),Linear Acceleration x (m/s^2)\n0,0\n1,0\n")
+    return folder
+
+
+def rosbag(path: Path, mcap: bool = False, frames: bool = False, raw: bool = True, version: int = 9) -> Path:
+    """Two IMUs, one of which begins later; as topics, or as frames of one topic."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    Imu, Header, Stamp = (
+        types[f"{name}"] for name in ("sensor_msgs/msg/Imu", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    Vector, Quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    covariance = np.zeros(9)
+    unknown = np.array([-1.0, *np.zeros(8)])
+    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    with Writer(path, version=version, storage_plugin=plugin) as writer:
+        topics = ["/imu"] if frames else ["/torso/imu", "/left_forearm/imu"]
+        connections = [writer.add_connection(topic, Imu.__msgtype__, typestore=store) for topic in topics]
+        for k in range(N):
+            for which, frame in enumerate(("torso", "left_forearm")):
+                if which and k < 10:
+                    continue
+                ns = 1000 * US0 + 10_000_000 * k
+                accel = own(ACCEL, path)[k] if which else ACCEL[k]
+                message = Imu(
+                    Header(Stamp(ns // 10**9, ns % 10**9), frame),
+                    Quaternion(*WXYZ[k, [1, 2, 3, 0]]),
+                    covariance if which == 0 or not raw else unknown,
+                    Vector(*GYRO[k]),
+                    covariance if raw else unknown,
+                    Vector(*accel),
+                    covariance,
+                )
+                writer.write(
+                    connections[0 if frames else which], ns + 777, store.serialize_cdr(message, Imu.__msgtype__)
+                )
+    return path
+
+
+def xdf(path: Path, streams: dict[str, tuple[list[str], list[str], np.ndarray]], cut: int = 0) -> Path:
+    """Streams by name: labels, units, values; written chunk by chunk as the specification has it."""
+
+    def chunk(tag: int, content: bytes) -> bytes:
+        return b"\x04" + struct.pack("<IH", len(content) + 2, tag) + content
+
+    data = b"XDF:" + chunk(1, b"<?xml version='1.0'?><info><version>1.0</version></info>")
+    for k, (name, (labels, units, values)) in enumerate(streams.items(), 1):
+        channels = "".join(
+            f"<channel><label>{label}</label><unit>{unit}</unit></channel>"
+            for label, unit in zip(labels, units, strict=True)
+        )
+        head = (
+            f"<info><name>{name}</name><type>IMU</type><channel_count>{len(labels)}</channel_count>"
+            f"<nominal_srate>100</nominal_srate><channel_format>double64</channel_format><source_id>{k}</source_id>"
+            f"<desc><channels>{channels}</channels></desc></info>"
+        )
+        data += chunk(2, struct.pack("<I", k) + head.encode())
+        for first in range(0, N, 100):
+            samples = b"".join(
+                b"\x08" + struct.pack(f"<{1 + len(labels)}d", 5000.0 + TIME[i], *values[i])
+                for i in range(first, first + 100)
+            )
+            data += chunk(3, struct.pack("<IBI", k, 4, 100) + samples)
+        data += chunk(4, struct.pack("<Idd", k, 5001.0, -100.0))
+    for k in range(1, len(streams) + 1):
+        foot = f"<info><first_timestamp>5000</first_timestamp><sample_count>{N}</sample_count></info>"
+        data += chunk(6, struct.pack("<I", k) + foot.encode())
+    path.write_bytes(data[: len(data) - cut])
+    return path
+
+
+LABELS = [f"{kind}_{a}" for kind in ("acc", "gyr") for a in "xyz"]
+
+
+SI = ["m/s^2"] * 3 + ["rad/s"] * 3
+
+
+def two_streams(path: Path, cut: int = 0) -> Path:
+    """One in g and °/s, with both sensors' channels in one stream; one in SI."""
+    one = np.column_stack([own(ACCEL, Path("a")) / G, np.degrees(GYRO)])
+    return xdf(
+        path,
+        {
+            "left_wrist": (LABELS, ["g"] * 3 + ["deg/s"] * 3, one),
+            "Sternum": (LABELS, SI, np.column_stack([ACCEL, GYRO])),
+        },
+        cut,
+    )
+
+
+MVN_SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
+
+
+HEAD = '<mvnx version="{version}"><mvn version="x"/><subject frameRate="{rate}" segmentCount="6">'
+
+
+def mvnx(
+    folder: Path,
+    quat_wxyz: np.ndarray,
+    *,
+    raw: bool = False,
+    version: str = "3",
+    rate: str = "50",
+    index: list[int] | None = None,
+    before: str = "",
+    end: str = "</frames></subject></mvnx>",
+    t_pose: str | None = "1 0 0 0 " * len(MVN_SEGMENTS),
+) -> Path:
+    """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z.
+
+    `t_pose`: the orientations in its frame of type tpose; None: it has no such frame.
+    """
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
+    lines += [f'<segment label="{name}" id="{k}"><points/></segment>' for k, name in enumerate(MVN_SEGMENTS, 1)]
+    lines += ["</segments><sensors>", '<sensor label="T8"/><sensor label="LeftForeArm"/>', "</sensors><frames>"]
+    poses = {"npose" if version == "2" else "identity": "1 0 0 0 " * len(MVN_SEGMENTS)}
+    if t_pose is not None:
+        poses["tpose"] = t_pose
+    lines += [f'<frame type="{pose}"><orientation>{quats}</orientation></frame>' for pose, quats in poses.items()]
+    for k, quats in enumerate(quat_wxyz):
+        number = k if index is None else index[k]
+        lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
+        lines.append(f"<orientation>{' '.join(f'{value:.9f}' for value in quats.ravel())}</orientation>")
+        if raw:
+            lines.append("<sensorAcceleration>0 0 9.81 0 9.81 0</sensorAcceleration>")
+            lines.append(f"<sensorAngularVelocity>{0.1 + 1e-4 * (k % 2)} 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
+        lines.append("</frame>")
+    (folder / "trial.mvnx").write_text("\n".join([*lines, end]), encoding="utf-8")
+    return folder / "trial.mvnx"
+
+
+def turning(n: int = 40) -> np.ndarray:
+    """(n, 6, 4) wxyz: each segment turns about z by its own angle."""
+    angles = np.linspace(0.0, 0.5, n)[:, None] * np.arange(1, len(MVN_SEGMENTS) + 1)
+    xyzw = Rotation.from_rotvec(angles.reshape(-1, 1) * [0.0, 0.0, 1.0]).as_quat()
+    return xyzw[:, [3, 0, 1, 2]].reshape(n, len(MVN_SEGMENTS), 4)
+
+
+MAKERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "mt_manager": ("a.txt", mt_manager),
+    "dot": ("a.csv", dot),
+    "ximu3": ("x", ximu3),
+    "opensim": ("a.sto", sto),
+    "apdm": ("apdm.csv", apdm),
+    "shimmer": ("torso.csv", shimmer),
+    "noraxon": ("torso.csv", noraxon),
+    "delsys": ("torso.csv", delsys),
+    "sensor_logger": ("torso", sensor_logger),
+    "phyphox": ("torso", phyphox),
+    "rosbag": ("torso_bag", rosbag),
+    "xdf": ("torso.xdf", two_streams),
+}
+
+
+def make(format: str, folder: Path) -> Path:
+    """Write a file or folder of a format, and return it."""
+    name, write = MAKERS[format]
+    return write(folder / name)
+
+
+def first_file(path: Path) -> Path:
+    """The file, or that of the rates in a folder."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files.sort(key=lambda file: file.name not in ("Gyroscope.csv", "Inertial.csv"))
+    return next(file for file in files if file.suffix != ".yaml")
