@@ -6,7 +6,6 @@ import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,44 +34,24 @@ class Signal(NamedTuple):
     values: np.ndarray  # (n, 3) in SI, or (n, 4) xyzw; NaN: lost
 
 
-@dataclass(frozen=True)
-class DeviceSensor:
-    """A sensor in a device's file.
+class DeviceSensor(NamedTuple):
+    """A sensor in a device's file."""
 
-    Parameters
-    ----------
-    time : (n,) [s] on the device's clock
-    signals : "gyro" [rad/s] and "accel" [m/s²] (n, 3), or "orientation" (n, 4) xyzw
-    segment : that its name says; None: it is not clear
-    mount : (4,) xyzw, sensor to segment, where the file states it
-    """
-
-    time: np.ndarray
-    signals: Mapping[str, np.ndarray]
-    segment: str | None = None
-    mount: np.ndarray | None = None
+    time: np.ndarray  # (n,) [s] on the device's clock
+    signals: Mapping[str, np.ndarray]  # "gyro" [rad/s] and "accel" [m/s²] (n, 3), or "orientation" (n, 4) xyzw
+    segment: str | None = None  # that its name says; None: it is not clear
+    mount: np.ndarray | None = None  # (4,) xyzw, sensor to segment, where the file states it
 
 
-@dataclass(frozen=True)
-class Device:
-    """The contents of a device's file.
+class Device(NamedTuple):
+    """The contents of a device's file."""
 
-    Parameters
-    ----------
-    kind : a key of `NEEDED`
-    sensors : the file's name of each sensor or segment → what it measured
-    since_power_on : the clock starts at power-on, or at another arbitrary moment
-    wraps_s : [s] after which such a clock wraps; None: it does not
-    aligned : the orientations are the segments' own, in one world
-    diagnostics : assumptions, and missing data
-    """
-
-    kind: str
-    sensors: Mapping[str, DeviceSensor]
-    since_power_on: bool = True
-    wraps_s: float | None = None
-    aligned: bool = False
-    diagnostics: tuple[Diagnostic, ...] = ()
+    kind: str  # a key of `NEEDED`
+    sensors: Mapping[str, DeviceSensor]  # the file's name of each sensor or segment → what it measured
+    since_power_on: bool = True  # the clock starts at power-on, or at another arbitrary moment
+    wraps_s: float | None = None  # [s] after which such a clock wraps; None: it does not
+    aligned: bool = False  # the orientations are the segments' own, in one world
+    diagnostics: tuple[Diagnostic, ...] = ()  # assumptions, and missing data
 
     @property
     def begin(self) -> float:
@@ -82,7 +61,7 @@ class Device:
 
 def make_device(
     path: Path,
-    found: Mapping[str, Mapping[str, Signal]],
+    sensors: Mapping[str, Mapping[str, Signal]],
     needs: str,
     use: str | None = None,
     rate_hz: float | None = None,
@@ -104,35 +83,31 @@ def make_device(
         No sensor has what `use` asks for; numbers that no device measures; signals without a time in common.
     """
     kinds = [use] if use else list(NEEDED)
-    kind = next((kind for kind in kinds if any(set(NEEDED[kind]) <= set(signals) for signals in found.values())), None)
+    of_kind = {
+        kind: {label: each for label, each in sensors.items() if set(NEEDED[kind]) <= set(each)} for kind in kinds
+    }
+    kind = next((kind for kind in kinds if of_kind[kind]), None)
     if kind is None:
         raise BadData(f"{path}: no sensor in it has {needs}{'; leave out data.use' if use else ''}")
-    sensors, diagnostics = {}, list(diagnostics)
-    chosen = {label: signals for label, signals in found.items() if set(NEEDED[kind]) <= set(signals)}
-    for label, signals in chosen.items():
+    device = Device(kind, read := dict[str, DeviceSensor]())
+    for label, signals in of_kind[kind].items():
         for signal in NEEDED[kind]:
             check_measured(f"{path}: {signal} of {label}", signals[signal].values)
         time, values = join_signals(f"{path.name} {label}", {name: signals[name] for name in NEEDED[kind]})
         if len(time) < FEWEST:
             raise BadData(f"{path}: holds {len(time)} samples of {label}; the export is empty or cut off")
-        texts = [label, *([hints[label]] if hints else []), *([path.absolute().stem] if len(chosen) == 1 else [])]
-        segment = next(filter(None, map(load_table().guess_segment, texts)), None)
-        sensors[label] = DeviceSensor(np.arange(len(time)) / rate_hz if rate_hz else time, values, segment)
-    left_out = [label for label in found if label not in chosen]
-    if left_out:
+        texts = [label, (hints or {}).get(label, ""), path.absolute().stem if len(of_kind[kind]) == 1 else ""]
+        segment = next(filter(None, map(load_table().guess_segment, filter(None, texts))), None)
+        read[label] = DeviceSensor(np.arange(len(time)) / rate_hz if rate_hz else time, values, segment)
+    if left_out := [label for label in sensors if label not in read]:
         facts = {"devices": ", ".join(left_out), "signals": " and ".join(NEEDED[kind])}
-        diagnostics.append(Diagnostic("sensors-left-out", WARNING, path.name, len(left_out), facts=facts))
-    return Device(kind, sensors, diagnostics=tuple(diagnostics))
+        missing = Diagnostic("sensors-left-out", WARNING, path.name, len(left_out), facts=facts)
+        diagnostics = [*diagnostics, missing]
+    return device._replace(diagnostics=tuple(diagnostics))
 
 
 def convert(path: Path, signal: str, values: np.ndarray, unit: str, column: str) -> np.ndarray:
-    """Convert values of gyro or accel to SI by what the file calls their unit.
-
-    Raises
-    ------
-    BadData
-        The unit is none that is known.
-    """
+    """Convert values of gyro or accel to SI by what the file calls their unit; raise `BadData` where it is unknown."""
     known = GYRO_UNITS if signal == "gyro" else ACCEL_UNITS
     guess = guess_unit(signal, unit)
     if guess is None:
@@ -155,12 +130,7 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
     """Join signals of different clocks on that of the first: times (n,) and values by signal.
 
     Values of the second signal between two samples are interpolated, NaN where these are further apart than
-    `LONGEST_STEPS`.
-
-    Raises
-    ------
-    BadData
-        They have no time in common.
+    `LONGEST_STEPS`. `BadData` is raised where they have no time in common.
     """
     (name, first), *rest = signals.items()
     if all(signal.time is first.time for _, signal in rest):
@@ -190,13 +160,7 @@ def _drop_missing(signal: Signal) -> Signal:
 
 @contextmanager
 def open_folder(path: Path) -> Iterator[dict[str, Path]]:
-    """Open a folder, or a zip of one, as name → file; of a file of neither kind, what lies beside it.
-
-    Raises
-    ------
-    BadData
-        The zip is damaged.
-    """
+    """Open a folder, or a zip of one, as name → file; of a file of neither kind, what lies beside it."""
     if path.suffix.lower() != ".zip" or path.is_dir():
         folder = path if path.is_dir() else path.absolute().parent
         yield {file.name: file for file in sorted(folder.iterdir()) if file.is_file()}
@@ -216,13 +180,7 @@ def check_measured(place: str, values: np.ndarray) -> None:
 
 
 def read_first_lines(path: Path, most: int = 100) -> list[str]:
-    """Read the first lines of a text file; bytes that are not UTF-8 are replaced.
-
-    Raises
-    ------
-    MissingFile
-        The file is missing or not readable.
-    """
+    """Read the first lines of a text file; bytes that are not UTF-8 are replaced."""
     try:
         with path.open("rb") as file:
             # The limit bounds the memory for a file without line ends.

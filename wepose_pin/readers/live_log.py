@@ -3,16 +3,10 @@
 Messages are JSON with JSON schemas (`SCHEMAS`); their log time is that of the newest sample, on the source's clock. The
 file is in chunks, so that what was written before a session was killed is readable.
 
-- metadata ``wepose``: the settings before the first sample, as JSON: sensors, stated mounts, subject, method, and the
-  sensors with measured `orientations`, each with whether it is the segment's own
-- ``/sensors/NAME``: a sample: ``t`` [s], ``gyro`` [rad/s] and ``accel`` [m/s²], or ``orientation`` xyzw. The messages
-  of all sensors are in the order of arrival
-- ``/events``: ``{"kind": "clock", …}`` when ticks began, ``{"kind": "start", "begin": tick, "end": tick}`` the start
-  pose of tracking, ``{"kind": "reset", "tick": tick}`` headings anew before that tick; and what was marked, with times
-  in seconds: ``{"kind": "begin", "phase": name, "time": t}`` and ``"end"`` of a phase, ``{"kind": "discard", "phase":
-  name}`` what was marked of it so far, ``{"kind": "mark", "text": …, "time": t}`` a text, ``{"kind": "assign",
-  "segments": {sensor: segment}}`` segments that differ from the names in the header
-- ``/pose``: a live pose: ``tick``, and ``quat_WL``, sensor → xyzw
+docs/live.md lists the topics. Events are ``clock`` when ticks began, ``start`` (``begin``, ``end``: ticks) the start
+pose of tracking, ``reset`` (``tick``) headings anew before that tick; and what was marked, in seconds: ``begin`` and ``end``
+of a phase (``phase``, ``time``), ``discard`` what was marked of it so far, ``mark`` a text (``text``, ``time``),
+``assign`` (``segments``: sensor → segment) segments that differ from the names in the header.
 """
 
 from __future__ import annotations
@@ -57,17 +51,11 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 
 
 class Markers:
-    """Phases and texts that were marked in a live session, and the segments of its sensors.
-
-    Attributes
-    ----------
-    texts : marked texts
-    segments : sensor → segment, of sensors that were assigned to another segment than their name
-    """
+    """Phases and texts that were marked in a live session, and the segments of its sensors."""
 
     def __init__(self) -> None:
         self.texts: list[Mark] = []
-        self.segments: dict[str, str] = {}
+        self.segments: dict[str, str] = {}  # sensor → segment, where it is not the sensor's name
         self._spans: dict[str, list[tuple[float, float]]] = {}
         self._open: dict[str, float] = {}
 
@@ -90,9 +78,9 @@ class Markers:
         spans = {name: list(own) for name, own in self._spans.items()}
         for name, begin in self._open.items():
             spans.setdefault(name, []).append((begin, last))
-        cut = {name: tuple((max(a, first), min(b, last)) for a, b in own) for name, own in spans.items()}
-        cut = {name: tuple(span for span in own if span[0] < span[1]) for name, own in cut.items()}
-        return {name: own for name, own in cut.items() if own}
+        cut = {name: [(max(a, first), min(b, last)) for a, b in own] for name, own in spans.items()}
+        inside = {name: tuple(span for span in own if span[0] < span[1]) for name, own in cut.items()}
+        return {name: own for name, own in inside.items() if own}
 
 
 class LiveRecording(NamedTuple):
@@ -165,23 +153,23 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     if rate_hz is not None:
         raise BadData(f"{path}: rate_hz = {rate_hz:g}: a live recording has times of its own; leave it out")
     recording = read_live_log(path).recording
-    sensors, kinds = {}, set()
+    sensors = {}
     for name, sensor in recording.sensors.items():
         if isinstance(sensor, OrientationSensor):
-            kind, signals = "orientation", {"orientation": sensor.quat_VS}
+            signals = {"orientation": sensor.quat_VS}
         else:
-            kind, signals = "raw", {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
-        kinds.add(kind)
+            signals = {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
         if sensor.gap is not None:
             signals = {key: np.where(sensor.gap[:, None], np.nan, values) for key, values in signals.items()}
         sensors[name] = DeviceSensor(recording.time, signals, name, sensor.stated_quat_LS)
-    if len(kinds) > 1 or use not in (None, kind):
-        raise BadData(f"{path}: use = {use!r}: it holds {' and '.join(sorted(kinds))} data; track it as it is")
+    kinds = sorted({"orientation" if "orientation" in each.signals else "raw" for each in sensors.values()})
+    if len(kinds) > 1 or use not in (None, *kinds):
+        raise BadData(f"{path}: use = {use!r}: it holds {' and '.join(kinds)} data; track it as it is")
     diagnostics = recording.diagnostics
     if recording.resets:
         diagnostics += (Diagnostic("heading-resets-not-repeated", INFO, path.name, len(recording.resets)),)
     aligned = all(sensor.aligned for sensor in recording.sensors.values())
-    return Device(kind, sensors, since_power_on=False, aligned=aligned, diagnostics=diagnostics)
+    return Device(kinds[0], sensors, since_power_on=False, aligned=aligned, diagnostics=diagnostics)
 
 
 def read_messages(path: Path) -> Iterator[tuple[str, bytes]]:

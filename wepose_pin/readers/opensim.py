@@ -9,7 +9,6 @@ Source: OpenSim documentation, OpenSense; the headers of OpenSense's example fil
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +64,7 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
         quats = {label: _segment_quat(label.removesuffix("_imu"), quat) for label, quat in quats.items()}
     found = {label: {"orientation": Signal(time, quat)} for label, quat in quats.items()}
     device = make_device(path, found, "gyroscope and accelerometer, a .sto has orientations", use, rate_hz)
-    return replace(device, since_power_on=False, aligned=own)
+    return device._replace(since_power_on=False, aligned=own)
 
 
 def _segment_quat(body: str, quat_GB: np.ndarray) -> np.ndarray:

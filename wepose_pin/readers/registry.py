@@ -31,8 +31,7 @@ class Format(NamedTuple):
     title : what a file of it is called
     detects : path, which may be a folder, and the first lines of a text → whether it is of this format
     read : path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents: raw data where a sensor has
-        them, else orientations, or only what is asked for; with a rate its times are replaced. It raises `BadData`
-        where the file is another, is damaged, lacks what is asked for, or needs a package that is not installed
+        them, else orientations, or only what is asked for; with a rate its times are replaced
     whole : all sensors of a recording are in one file
     folder : a recording may be a folder
     """
@@ -45,6 +44,11 @@ class Format(NamedTuple):
 
 
 TEXTS = (".json", ".csv", ".tsv", ".txt", ".xml")  # whose first lines may tell the format
+
+
+def _has_suffix(path: Path, *suffixes: str) -> bool:
+    return path.suffix.lower() in suffixes
+
 
 # Formats that are no tables of one kind; pyproject.toml registers them as those of other distributions.
 MVNX = Format("Xsens MVNX", lambda path, start: _has_suffix(path, ".mvnx") or "<mvnx" in start, read_mvnx, whole=True)
@@ -62,14 +66,9 @@ ROSBAG = Format(
     folder=True,
 )
 XDF = Format("XDF", lambda path, _: _has_suffix(path, ".xdf", ".xdfz"), read_xdf, whole=True)
-OPENSIM = Format(
-    "OpenSim table of IMU orientations", lambda path, _: _has_suffix(path, ".sto"), read_opensim, whole=True
-)
+STO = "OpenSim table of IMU orientations"
+OPENSIM = Format(STO, lambda path, _: _has_suffix(path, ".sto"), read_opensim, whole=True)
 WEPOSE_LIVE = Format("recording of wepose live", lambda path, _: is_live_log(path), read_live_device, whole=True)
-
-
-def _has_suffix(path: Path, *suffixes: str) -> bool:
-    return path.suffix.lower() in suffixes
 
 
 def look_up_format(name: str) -> Format | TableFormat:
@@ -80,13 +79,7 @@ def look_up_format(name: str) -> Format | TableFormat:
 
 
 def find_format(name: str, folder: Path, place: str) -> str:
-    """Find a format by its name, or the path of a description from the folder of the session; `place` states it.
-
-    Raises
-    ------
-    WeposeError
-        It is not known; the description is missing or wrong.
-    """
+    """Find a format by its name, or the path of a description from the folder of the session; `place` states it."""
     if name.endswith(".toml"):
         load_format(folder / name)
         return str(folder / name)
@@ -100,11 +93,6 @@ def detect_format(path: Path) -> str | None:
     """Detect the format of a file or folder from its suffix and first lines; None: none of them.
 
     A description beside the file (`*.toml` with `detect`) goes before those of the package; its path is the format.
-
-    Raises
-    ------
-    WeposeError
-        The file is not readable.
     """
     if not (path.is_file() or path.is_dir()) and path.exists():
         return None

@@ -21,7 +21,6 @@ from ..diagnostics import WARNING, Diagnostic
 from ..libraries import library_errors
 from .device import Device, Signal, join_signals, make_device, open_folder, read_first_lines
 
-NS = 1e-9
 COLUMNS = {
     **dict.fromkeys(("Gyroscope", "TotalAcceleration", "Accelerometer", "Gravity"), ("x", "y", "z")),
     "Orientation": ("qx", "qy", "qz", "qw"),
@@ -44,25 +43,28 @@ def is_sensor_logger(path: Path) -> bool:
 def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """Read a phone, as `Format.read`."""
     tables = _read_tables(path)
-    signals = {name: _read_signal(path, name, tables[name]) for name in COLUMNS if name in tables}
-    total = signals.get("TotalAcceleration")
-    if total is None and {"Accelerometer", "Gravity"} <= set(signals):
+    signals = {}
+    for name in (name for name in COLUMNS if name in tables):
+        values = read_columns(tables[name], ["time", *COLUMNS[name]], f"{name}.csv", str(path))
+        signals[name] = Signal(1e-9 * values[:, 0], values[:, 1:])
+    if "TotalAcceleration" not in signals and {"Accelerometer", "Gravity"} <= set(signals):
         time, parts = join_signals(path.name, {name: signals[name] for name in ("Accelerometer", "Gravity")})
-        total = Signal(time, parts["Accelerometer"] + parts["Gravity"])
-    found, diagnostics = {}, []
-    if total is not None and "Gyroscope" in signals:
+        signals["TotalAcceleration"] = Signal(time, parts["Accelerometer"] + parts["Gravity"])
+    phone, diagnostics = {}, []
+    if {"TotalAcceleration", "Gyroscope"} <= set(signals):
         about = tables["Metadata"].row(0, named=True) if len(tables.get("Metadata", ())) else {}
         platform = str(about.get("platform") or "").lower()
         standard = str(about.get("standardisation") or about.get("standardization")).lower() == "true"
         if not platform and use != "orientation":
             diagnostics.append(Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "sign"}))
+        time, accel = signals["TotalAcceleration"]
         sign = -1.0 if platform == "ios" and not standard else 1.0
-        found = {"gyro": signals["Gyroscope"], "accel": Signal(total.time, sign * total.values)}
+        phone = {"gyro": signals["Gyroscope"], "accel": Signal(time, sign * accel)}
     if "Orientation" in signals:
-        found["orientation"] = signals["Orientation"]
+        phone["orientation"] = signals["Orientation"]
     folder = path if path.is_dir() or path.suffix.lower() in (".zip", ".json") else path.absolute().parent
     label = folder.stem if folder.is_file() else folder.absolute().name
-    return make_device(path, {label: found}, NEEDS, use, rate_hz, diagnostics)
+    return make_device(path, {label: phone}, NEEDS, use, rate_hz, diagnostics)
 
 
 def _read_tables(path: Path) -> dict[str, pl.DataFrame]:
@@ -75,8 +77,3 @@ def _read_tables(path: Path) -> dict[str, pl.DataFrame]:
         for entry in json.loads(path.read_bytes()):
             by_sensor.setdefault(entry["sensor"], []).append(entry)
         return {name: pl.DataFrame(entries) for name, entries in by_sensor.items()}
-
-
-def _read_signal(path: Path, name: str, table: pl.DataFrame) -> Signal:
-    values = read_columns(table, ["time", *COLUMNS[name]], f"{name}.csv", str(path))
-    return Signal(NS * values[:, 0], values[:, 1:])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import fnmatch
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -147,7 +147,7 @@ class TableFormat(NamedTuple):
             diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
         needs = f"{self.needs}; it has: {', '.join(filter(None, tables[0].names[:12]))}"
         device = make_device(path, devices, needs, use, rate_hz if joins else None, diagnostics)
-        return replace(device, wraps_s=None if joins else wraps_s)
+        return device._replace(wraps_s=None if joins else wraps_s)
 
     def is_time(self, name: str) -> bool:
         """Return whether a column of this name gives the time."""
