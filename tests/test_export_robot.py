@@ -20,7 +20,7 @@ from test_export import a_pose, write_folder
 
 from wepose_pin.body.subject import population_subject
 from wepose_pin.commands import main
-from wepose_pin.errors import WeposeError, WrongOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.tracking import TrackResult
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (
@@ -159,13 +159,6 @@ def test_an_interval_outside_is_left_out_and_the_others_are_episodes(trajectory:
     exported = export(trajectory, tmp_path / "data", "lerobot", episodes="reach", interval=(1.5, 2.6))
     assert [(each.code, each.value) for each in exported.diagnostics] == [("episodes-cut", 1.0)]
     assert json.loads((tmp_path / "data" / "meta" / "info.json").read_text())["total_episodes"] == 1
-
-
-def test_a_movement_that_does_not_repeat_is_said_to(tmp_path: Path) -> None:
-    folder = write_trajectory_folder(tmp_path / "arm")
-    change_summary(folder, repetitions={"source": "right_elbow_flexion", "spans": [], "reason": "5 are unlike"})
-    with pytest.raises(WrongOption, match=r"no repetitions were found in it; .*reach"):
-        export(folder, tmp_path / "data", "lerobot", episodes="repetitions")
 
 
 def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -> None:

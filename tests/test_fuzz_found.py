@@ -26,7 +26,6 @@ from wepose_pin.errors import (
     WeposeError,
     printable,
 )
-from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.recording.faults import check_sensors
 
 BY_NAME = {target.name: target for target in TARGETS}
@@ -168,21 +167,6 @@ def test_a_summary_that_is_none(tmp_path: Path) -> None:
 
 
 # Archives ----------------------------------------------------------------------------------------------------------
-
-
-def test_what_an_hdf5_file_names_outside_is_not_read(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    np.arange(8.0).tofile(tmp_path / "secret")
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["x"] = np.arange(8.0)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["own"] = np.arange(8.0)
-        file.create_dataset("raw", shape=(8,), dtype="f8", external=[(str(tmp_path / "secret"), 0, 64)])
-        file["link"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/x")
-        layout = h5py.VirtualLayout(shape=(8,), dtype="f8")
-        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", shape=(8,))
-        file.create_virtual_dataset("virtual", layout)
-    assert list(ArrayFile(tmp_path / "a.h5").shapes) == ["/own"]
 
 
 # URDF --------------------------------------------------------------------------------------------------------------

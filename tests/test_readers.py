@@ -247,14 +247,6 @@ def test_accepted_gaps_are_marked_and_counted_in_the_result(tmp_path: Path, caps
     assert (torso["gaps"], torso["gap_s"]) == (2, 0.7)
 
 
-def test_without_a_gap_nothing_is_marked_though_gaps_are_accepted(tmp_path: Path) -> None:
-    path = write(tmp_path, table_at(np.arange(500) / 100.0))
-    gap = load_session(path, gaps=True).sensors["torso"].gap
-    assert gap is not None
-    assert not gap.any()
-    assert load_session(path).sensors["torso"].gap is None
-
-
 # Clocks ------------------------------------------------------------------------------------------------------------
 
 
@@ -274,16 +266,6 @@ def test_an_uneven_rate_is_resampled_on_the_rotation(spread: float, tmp_path: Pa
     assert (resampled.code, resampled.facts["rate"]) == ("time-stamps-uneven", pytest.approx(recording.rate_hz))
     assert resampled.facts["variant"] == ("uneven" if spread > 0.5 else "changing")
     assert resampled.facts["shortest"] < 0.01 < resampled.facts["longest"]
-
-
-def test_jitter_of_a_clock_is_left_alone(tmp_path: Path) -> None:
-    """As `prova_HR.txt`: a step in 500 is 11 instead of 10."""
-    steps = np.full(3000, 0.001)
-    steps[::500] = 0.0011
-    table = table_at(np.concatenate([[0.0], np.cumsum(steps)]))
-    recording = load_session(write(tmp_path, table))
-    assert recording.diagnostics == ()
-    np.testing.assert_array_equal(recording.sensors["torso"].gyro_S, table[SIGNALS["gyro"]])
 
 
 @pytest.mark.parametrize(

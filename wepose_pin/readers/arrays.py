@@ -1,7 +1,7 @@
 """HDF5 and MATLAB files: arrays by their path, as ``/imu/torso/gyro``, and single columns of them, ``/imu/gyro[0]``.
 
 An array is (n,), (n, k) or (k, n) with n samples; the fields of a MATLAB struct are a path's parts. HDF5, and with it
-MATLAB's v7.3, needs h5py, which is optional. Arrays in other files, by links or otherwise, are not read.
+MATLAB's v7.3, needs h5py, which is optional.
 """
 
 from __future__ import annotations
@@ -108,10 +108,8 @@ class ArrayFile:
         shapes: dict[str, tuple[int, ...]] = {}
 
         def visit(name: str, node: Any) -> None:
-            # A group has no type; the numbers of an external or a virtual array are in another file.
-            if getattr(node, "dtype", None) is None or node.external or node.is_virtual:
-                return
-            if node.dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
+            dtype = getattr(node, "dtype", None)  # a group has none
+            if dtype is not None and dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
                 shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
 
         with library_errors(self.path, KIND), self._hdf5.File(self.path) as file:

@@ -4,9 +4,9 @@ Messages are JSON with JSON schemas (`SCHEMAS`); their log time is that of the n
 file is in chunks, so that what was written before a session was killed is readable.
 
 docs/live.md lists the topics. Events are ``clock`` when ticks began, ``start`` (``begin``, ``end``: ticks) the start
-pose of tracking, ``reset`` (``tick``) headings anew before that tick; and what was marked, in seconds: ``begin`` and ``end``
-of a phase (``phase``, ``time``), ``discard`` what was marked of it so far, ``mark`` a text (``text``, ``time``),
-``assign`` (``segments``: sensor → segment) segments that differ from the names in the header.
+pose of tracking, ``reset`` (``tick``) headings anew before that tick; and what was marked, in seconds: ``begin`` and
+``end`` of a phase (``phase``, ``time``), ``discard`` what was marked of it so far, ``mark`` a text (``text``,
+``time``), ``assign`` (``segments``: sensor → segment) segments that differ from the names in the header.
 """
 
 from __future__ import annotations
