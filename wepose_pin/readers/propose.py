@@ -42,33 +42,19 @@ MOST_SIBLINGS = 20
 
 @dataclass
 class Proposal:
-    """The contents of a proposed session.
+    """The contents of a proposed session."""
 
-    Parameters
-    ----------
-    path : the data
-    folder : of the session
-    body : whose segments carry the sensors
-    title : kind of file
-    data : keys of [data]
-    sensors : segment, or "?" and a name of the file → keys of its [sensors.…]
-    checks : (table, key) → what the user has to check there
-    labels : segment → its name in the file
-    facts : other facts from the file, one line each
-    phases : that the file states
-    """
-
-    path: Path
-    folder: Path
-    body: BodyTable
-    title: str
-    data: dict[str, Any] = field(default_factory=dict)
-    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)
-    checks: dict[tuple[str, str], str] = field(default_factory=dict)
-    labels: dict[str, str] = field(default_factory=dict)
-    facts: list[str] = field(default_factory=list)
+    path: Path  # of the data
+    folder: Path  # of the session
+    body: BodyTable  # whose segments carry the sensors
+    title: str  # kind of file
+    data: dict[str, Any] = field(default_factory=dict)  # keys of [data]
+    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # segment, or "?" and a name of the file → keys
+    checks: dict[tuple[str, str], str] = field(default_factory=dict)  # (table, key) → what the user has to check there
+    labels: dict[str, str] = field(default_factory=dict)  # segment → its name in the file
+    facts: list[str] = field(default_factory=list)  # from the file, one line each
     diagnostics: list[Diagnostic] = field(default_factory=list)
-    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # that the file states
 
     def relative(self, path: Path) -> str:
         """Return a path as the session names it."""

@@ -219,23 +219,14 @@ def _select(files: Mapping[str, Path], pattern: str) -> list[Path]:
 
 @dataclass(frozen=True)
 class DeviceTable:
-    """A table.
-
-    Parameters
-    ----------
-    path : the file
-    names, units : of the columns
-    about : name → value of the lines `name: value` before the names
-    cells : columns "0", "1", … that the description names, without rows that have no values in them
-    times : column → times (n,) [s] that were read from it; None: of a rate
-    """
+    """A table."""
 
     path: Path
-    names: Sequence[str]
+    names: Sequence[str]  # of the columns
     units: Sequence[str]
-    about: Mapping[str, str]
-    cells: pl.DataFrame
-    times: dict[int | None, np.ndarray] = field(default_factory=dict)
+    about: Mapping[str, str]  # name → value of the lines `name: value` before the names
+    cells: pl.DataFrame  # columns "0", "1", … that the description names, without rows that have no values in them
+    times: dict[int | None, np.ndarray] = field(default_factory=dict)  # [s] read from a column; None: of a rate
 
     def has_values(self, columns: Iterable[int]) -> bool:
         """Return whether each of some columns has a value in any cell."""

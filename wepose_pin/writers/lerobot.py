@@ -22,9 +22,7 @@ from .joint_motion import REPETITIONS, JointMotion
 from .motion import is_even
 from .result import write_table
 
-VERSION = "v3.0"
 STATE, ACTION = "observation.state", "action"
-COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 FILE = Path("chunk-000", "file-000.parquet")
 
@@ -78,27 +76,12 @@ def write_lerobot(
         about |= {f"stats/{feature}/{name}": [each[feature][name] for each in stats] for name in of_feature}
     write_table(folder / "meta" / "episodes" / FILE, pl.DataFrame(about))
     _write_tasks(folder / "meta" / "tasks.parquet", tasks)
-    joints = {"dtype": "float32", "shape": [len(motions[0].joints)], "names": list(motions[0].joints)}
-    info = {
-        "codebase_version": VERSION,
-        "robot_type": motions[0].name,
-        "total_episodes": len(listed),
-        "total_frames": int(begins[-1]),
-        "total_tasks": len(tasks),
-        "chunks_size": 1000,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": rate_hz,
-        "splits": {"train": f"0:{len(listed)}"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
-        "features": {
-            STATE: joints,
-            ACTION: joints,
-            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-            **{name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS},
-        },
-    }
+    info = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))  # what all data sets have
+    info |= {"robot_type": motions[0].name, "total_episodes": len(listed), "total_frames": int(begins[-1])}
+    info |= {"total_tasks": len(tasks), "fps": rate_hz, "splits": {"train": f"0:{len(listed)}"}}
+    names = list(motions[0].joints)
+    joints = {"dtype": "float32", "shape": [len(names)], "names": names}
+    info["features"] |= {STATE: joints, ACTION: joints}
     for name, content in (("stats", _compute_stats(pl.concat(tables))), ("info", info)):
         (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
     return diagnostics

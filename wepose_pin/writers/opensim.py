@@ -12,8 +12,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from string import Template
+from xml.sax.saxutils import escape
 
 import numpy as np
 import polars as pl
@@ -25,6 +25,7 @@ from ..readers.opensim import OWN
 from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
 from .rajagopal import LENGTHS, coordinates, in_ground, orientations
 
+SETUPS = Path(__file__).parent / "opensim_setups"
 GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
 # [rad] rms by which the model may miss a body. Its elbow turns about an axis that is 13 deg oblique: arms of simulated
 # people, whose orientations are exact, are missed by 3 to 7 deg, of a real recording by up to 9.
@@ -115,25 +116,16 @@ def write_setups(sto: Path, written: Sequence[Path], motion: Motion, model: str)
     `model` is the name of the subject's model.
     """
     write_placement(written[0], motion)
-    placed_model = f"{sto.stem}_placed.osim"  # with sensors, which the IMU Placer writes
-    placer = {
-        "model_file": model,
-        "sensor_to_opensim_rotations": "0 0 0",
-        "orientation_file_for_calibration": f"{sto.stem}_placement.sto",
-        "output_model_file": placed_model,
-    }
-    _write_setup(written[1], "IMUPlacer", placer)
+    written[1].write_bytes(_fill("placer", model=model, stem=sto.stem))
     step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
-    ik = {
-        "model_file": placed_model,
-        "orientations_file": sto.name,
-        "sensor_to_opensim_rotations": "0 0 0",
-        "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
-        "report_errors": "true",
-        "results_directory": ".",
-        "output_motion_file": f"{sto.stem}_ik.mot",
-    }
-    _write_setup(written[2], "IMUInverseKinematicsTool", ik)
+    begin, end = (f"{time:.6f}" for time in (motion.pose.time[0] - step, motion.pose.time[-1] + step))
+    written[2].write_bytes(_fill("ik", stem=sto.stem, orientations=sto.name, begin=begin, end=end))
+
+
+def _fill(setup: str, *, scales: str = "", **values: str) -> bytes:
+    """Fill a set-up in ``opensim_setups/``; `scales` are XML already."""
+    template = Template((SETUPS / f"{setup}.xml").read_text(encoding="utf-8"))
+    return template.substitute({name: escape(value) for name, value in values.items()}, scales=scales).encode()
 
 
 # The model --------------------------------------------------------------------------------------------------------
@@ -158,36 +150,13 @@ def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MOD
                 factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(scaled)
     if not factors:
         raise BadData(f"{motion.where}: the body has no length that OpenSim's model of a person has")
-    scales = [
-        {"scales": " ".join(f"{value:.9f}" for value in of.values()), "segment": body, "apply": "true"}
+    scales = "".join(
+        _fill("scale_body", body=body, **{axis: f"{value:.9f}" for axis, value in of.items()}).decode()
         for body, of in factors.items()
-    ]
-    scaler = {
-        "apply": "true",
-        "scaling_order": "manualScale",
-        "ScaleSet": {"objects": {"Scale": scales}},
-        "preserve_mass_distribution": "true",
-        "output_model_file": f"{_final_name(path).removesuffix('.xml')}.osim",
-    }
+    )
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
-    tool = {"GenericModelMaker": {"model_file": str(osim_model)}, "ModelScaler": scaler}
-    _write_setup(path, "ScaleTool", {"mass": "-1", **tool}, name)
-
-
-def _write_setup(path: Path, tool: str, properties: Mapping[str, Any], name: str = "") -> None:
-    def add(parent: Element, properties: Mapping[str, Any]) -> None:
-        for key, value in properties.items():
-            for each in value if isinstance(value, list) else [value]:  # objects of the same name
-                child = SubElement(parent, key)
-                if isinstance(each, Mapping):
-                    add(child, each)
-                else:
-                    child.text = each
-
-    document = Element("OpenSimDocument", Version="40000")
-    add(SubElement(document, tool, name=name or tool), properties)
-    indent(document, "\t")
-    path.write_bytes(tostring(document, encoding="UTF-8", xml_declaration=True) + b"\n")
+    stem = _final_name(path).removesuffix(".xml")
+    path.write_bytes(_fill("scale", name=name, model=str(osim_model), stem=stem, scales=scales))
 
 
 # Points -----------------------------------------------------------------------------------------------------------
