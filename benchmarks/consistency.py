@@ -37,7 +37,7 @@ from wepose_pin.tracking import TrackResult, track
 FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
 SCORED_POINTS = ("left_shoulder", "right_shoulder", "right_elbow", "right_palm")
-SCORED_JOINTS, SHOULDER_SEQUENCE = ("right_shoulder", "right_elbow"), "XZY"  # whose lock a working arm is far from
+SCORED_JOINTS, SHOULDER_SEQUENCE = ("right_shoulder", "right_elbow"), "ZXY"  # whose lock a working arm is far from
 FREE = "free"  # no closure: reaches, rests and typing
 
 
@@ -114,9 +114,10 @@ def compare_pose(tracked: TrackResult, simulation: Simulation) -> dict[str, Any]
     for joint in SCORED_JOINTS:
         std = estimated[joint].std
         assert std is not None  # the filter has a covariance
+        read = rows[~(estimated[joint].near_lock | true[joint].near_lock)[rows]]
         for k, angle in enumerate(estimated[joint]):
-            off = wrap(estimated[joint][angle] - true[joint][angle])[rows]
-            angles[f"{joint} {angle}"] = list(zip(off, std[rows, k], strict=True))
+            off = wrap(estimated[joint][angle] - true[joint][angle])[read]
+            angles[f"{joint} {angle}"] = list(zip(off, std[read, k], strict=True)) or [(np.nan, np.nan)]
     return {"segments": whole, **points, **segments, "palm from shoulders": palm, **angles}
 
 
@@ -129,12 +130,12 @@ def summarize(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
             continue
         # A person counts as one, however many samples: errors of a person's samples are alike.
         each = [np.array(result[quantity]) for result in good]
-        by_std = np.sqrt([np.mean((pairs[:, 0] / pairs[:, 1]) ** 2) for pairs in each])
+        by_std = np.sqrt([np.nanmean((pairs[:, 0] / pairs[:, 1]) ** 2) for pairs in each])
         rows[quantity] = {
-            "error": float(np.sqrt(np.mean([np.mean(pairs[:, 0] ** 2) for pairs in each]))),
-            "std": float(np.sqrt(np.mean([np.mean(pairs[:, 1] ** 2) for pairs in each]))),
-            "by_std": float(np.sqrt(np.mean(by_std**2))),
-            "largest": float(np.max(by_std)),
+            "error": float(np.sqrt(np.nanmean([np.nanmean(pairs[:, 0] ** 2) for pairs in each]))),
+            "std": float(np.sqrt(np.nanmean([np.nanmean(pairs[:, 1] ** 2) for pairs in each]))),
+            "by_std": float(np.sqrt(np.nanmean(by_std**2))),
+            "largest": float(np.nanmax(by_std)),
         }
     return rows
 
