@@ -85,7 +85,7 @@ class Browser:
         """What an expression of the page's gives."""
         return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
-    def wait(self, script: str, seconds: float = 30.0, meanwhile: Callable[[], None] = lambda: None) -> Any:
+    def wait(self, script: str, seconds: float = 120.0, meanwhile: Callable[[], None] = lambda: None) -> Any:
         """What an expression gives as soon as it is true."""
         until = time.monotonic() + seconds
         while not (value := self.run(f"(() => {{ try {{ return {script} }} catch {{ return null }} }})()")):

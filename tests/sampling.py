@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ S = TypeVar("S", bound=Source)
 
 
 @contextmanager
-def connected(source: S | str, seconds: float = 10.0, **options: object) -> Iterator[S]:
+def connected(source: S | str, seconds: float = 60.0, **options: object) -> Iterator[S]:
     """A source, or that of a spec and its options, once all that it waits for is there; closed at the end."""
     if isinstance(source, str):
         source = open_source(source, **options)  # type: ignore[arg-type, assignment]
@@ -33,7 +33,7 @@ def connected(source: S | str, seconds: float = 10.0, **options: object) -> Iter
         source.close()  # twice is no error
 
 
-def collect(source: Source, count: int, sensors: int = 1, seconds: float = 5.0) -> dict[str, Samples]:
+def collect(source: Source, count: int, sensors: int = 1, seconds: float = 60.0) -> dict[str, Samples]:
     """The samples of each sensor, joined, as soon as so many sensors have sent `count`, or what came until then."""
     parts: dict[str, list[Samples]] = {}
     deadline = time.monotonic() + seconds
@@ -46,6 +46,14 @@ def collect(source: Source, count: int, sensors: int = 1, seconds: float = 5.0) 
         name: Samples(name, *(np.concatenate(column) for column in tuple(zip(*own, strict=True))[1:]))
         for name, own in parts.items()
     }
+
+
+def wait_until(happens: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait until something has happened in another thread or process."""
+    deadline = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def find_free_port() -> int:

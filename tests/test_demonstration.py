@@ -7,7 +7,7 @@ import pytest
 
 from wepose_pin.body import load_model
 from wepose_pin.calibration import load_protocol
-from wepose_pin.live.demonstration import Demonstration
+from wepose_pin.live.guide import Demonstration
 from wepose_pin.live.state import GuideView
 
 

@@ -24,11 +24,10 @@ from wepose_pin.calibration import Calibration, calibrate, load_protocol
 from wepose_pin.commands.guide import choose_parts, choose_protocol
 from wepose_pin.commands.live import live
 from wepose_pin.errors import BadSession
-from wepose_pin.live import open_source
+from wepose_pin.live import Output, Request, SensorSetup, Status, open_source
 from wepose_pin.live.assignment import read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
-from wepose_pin.live.setup import SensorSetup
-from wepose_pin.live.state import GuideView, Output, Request, Status
+from wepose_pin.live.state import GuideView
 from wepose_pin.live.steps import make_steps
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
@@ -112,13 +111,15 @@ class Session:
             moments.append(moment)
             if until(moment):
                 return moments
-            assert moment.time < seconds, moment
+            assert moment.time < seconds or moment.step == "quality", moment
         return moments
 
     def _moments(self) -> Iterator[Moment]:
-        guide = self.guide
+        guide, deadline = self.guide, time.monotonic() + 600.0  # of a busy machine's calibration
         while guide.accepted is None:
+            assert time.monotonic() < deadline
             guide.process(self.source.read(0.1))
+            guide.build_status()  # as the loop does
             view, step = guide.view(), guide.step.name
             self.person.follow(step, self.obeys(step, view), view.countdown)
             yield Moment(self.source.clock(), step, view)
@@ -137,7 +138,7 @@ def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path
     assert session.clicks == ["next", "next", "accept"]
     assert session.guide.segments == session.person.worn
     assert [*dict.fromkeys(moment.step for moment in moments)] == [
-        "sensors", "assignment", "static", "start", "clasp", "quality",
+        "sensors", "assignment", "start", "clasp", "quality",
     ]  # fmt: skip
     assert session.guide.accepted is not None
     live = session.guide.accepted.calibration
@@ -201,7 +202,7 @@ def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     session = Session(tmp_path)
     session.source.accel_scale = 1.0 / STANDARD_GRAVITY
     moment = session.run(lambda m: "norm" in m.view.note)[-1]
-    assert moment.step == "static"
+    assert moment.step == "start"
     assert re.search(r"accel: norm 1.*: g\? The source must give rad/s and m/s\^2", moment.view.note)
     session.guide.close()
 
@@ -235,22 +236,20 @@ def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> 
     session.guide.close()
 
 
-def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path: Path) -> None:
+def test_a_short_loss_is_bridged_and_a_long_one_needs_the_start_pose_again(tmp_path: Path) -> None:
     session = Session(tmp_path)
     begin(session, "clasp", 5.0)
     session.person.silent = {"left_forearm"}
     note = session.run(lambda m: bool(m.view.note))[-1].view.note
-    assert note == "No samples from left forearm: it goes on when they come again."
-    back = session.source.clock() + 0.5
-    session.run(lambda m: m.time > back)
+    assert note == "No samples from left forearm. Switched on and in reach?"
     session.person.silent = set()
     begin(session, "clasp", 8.0)
-    (_, paused), (resumed, _) = session.guide.attempt.recording().phases["clasp"]
-    assert 3.0 < resumed - paused < 5.0
+    ((first, last),) = session.guide.attempt.recording().phases["clasp"]
+    assert last - first >= 8.0
     # All are silent for ten seconds, as when the laptop sleeps.
     session.source.asleep_s = 10.0
-    again = session.run(lambda m: m.step == "start")[-1].view
-    assert again.note.startswith("No samples from any sensor for 10 s, and headings were lost")
+    note = session.run(lambda m: m.step == "start")[-1].view.note
+    assert note == "No samples from any sensor. Switched on and in reach? Headings were lost: begin once more."
     assert session.guide.segments == session.person.worn
     session.run(lambda m: m.step == "clasp")
     assert session.guide.attempts == 1
@@ -431,7 +430,7 @@ def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None
                 views=[view],
                 until=stop,
             )
-    assert view.steps == ["sensors", "assignment", "static", "start", "clasp", "bow", "quality"]
+    assert view.steps == ["sensors", "assignment", "start", "clasp", "bow", "quality"]
     assert read_segments(tmp_path / "anna", load_model().table.segments) == person.worn
     assert {"hold", "approach", "follow"} <= states
     assert outcome.session is not None

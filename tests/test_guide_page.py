@@ -25,7 +25,7 @@ from wepose_pin.simulation import simulate_person
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
 LENGTHS = simulate_person(PERSON[0]).lengths
 ROOT = Path(__file__).parents[1]
-STEPS = ["Sensors", "Segments", "Check", "Start pose", "Clasp", "Result"]
+STEPS = ["Sensors", "Segments", "Start pose", "Clasp", "Result"]
 SAID = """JSON.stringify({
   step: document.getElementById("steps").hidden ? "" : document.querySelector("#steps .now").textContent,
   says: document.querySelector("#say span").textContent,
@@ -62,7 +62,7 @@ class Reader:
         self.clicks.append(action)
         self.browser.run(f"document.querySelector('#actions [data-action={action}]').click()")
 
-    def until(self, step: str = "", state: str = "", seconds: float = 120.0) -> dict[str, Any]:
+    def until(self, step: str = "", state: str = "", seconds: float = 300.0) -> dict[str, Any]:
         """Read and press until the page is at a step or in a state."""
         deadline = time.monotonic() + seconds
         pressed = {("Sensors", "next"), ("Start pose", "next"), ("Result", "accept")}
@@ -103,21 +103,22 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
             reader = Reader(browser, person)
             reader.until("Clasp")
             # The page is loaded again in the middle of the motion: it shows where the guide stands.
-            deadline = time.monotonic() + 60.0
+            deadline = time.monotonic() + 180.0
             while not (said := reader.read()) or not said["lengths"]:
                 assert time.monotonic() < deadline, said
                 time.sleep(0.2)
             browser.go(url)
             assert reader.until("Clasp")["actions"]
             reader.until("Result")
-            reader.until(state="ready", seconds=180.0)
+            reader.until(state="ready")
             assert reader.steps == STEPS
             assert reader.clicks == ["next", "next", "accept"]
-            browser.run("document.querySelector('[data-action=take]').click()")
-            browser.wait("document.querySelector('[data-action=take]')?.ariaPressed === 'true'")
-            time.sleep(2.0)
-            browser.run("document.querySelector('[data-action=take]').click()")
-            browser.wait("document.querySelector('[data-action=take]')?.ariaPressed === null")
+            moments = [time.monotonic()]
+            for pressed in ("'true'", "null"):
+                browser.run("document.querySelector('[data-action=take]').click()")
+                browser.wait(f"document.querySelector('[data-action=take]')?.ariaPressed === {pressed}")
+                moments.append(time.monotonic())
+                time.sleep(2.0)
             browser.wait(
                 "!document.getElementById('curves').hidden && document.getElementById('joint').value === 'elbow'"
             )
@@ -125,7 +126,7 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
     finally:
         browser.close()
         run.terminate()
-        out, err = run.communicate(timeout=60)
+        out, err = run.communicate(timeout=180)
     assert run.returncode == 0, err
     assert "anna/session-1.mcap" in out
     # The subject that tracking used is that of the offline calibration of the same samples.
@@ -143,5 +144,5 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
     export = [sys.executable, "-m", "wepose_pin", "export", "result", "--phase", "take_1", "-o", "take.parquet"]
     subprocess.run(export, check=True, cwd=tmp_path, env=environment, capture_output=True)
     take = pl.read_parquet(tmp_path / "take.parquet")["time"]
-    assert 1.5 < take[-1] - take[0] < 8.0
+    assert 1.5 < take[-1] - take[0] < moments[2] - moments[0] + 0.5
     assert np.all(np.diff(take.to_numpy()) > 0.0)

@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import person, write_arm
-from sampling import find_free_port
+from sampling import find_free_port, wait_until
 from scipy.spatial.transform import Rotation
 from test_causal import first
 
@@ -29,8 +29,8 @@ import wepose_pin as wp
 from wepose_pin import retargeting
 from wepose_pin.body.kinematics import Pose
 from wepose_pin.commands import main
+from wepose_pin.live import LivePose, StreamInfo
 from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, command_json
-from wepose_pin.live.state import LivePose, StreamInfo
 from wepose_pin.retargeting.stream import APPROACH_SPEED
 from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
@@ -293,27 +293,33 @@ class Receiver(threading.Thread):
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.05)
         self.port = str(self._socket.getsockname()[1])
-        self._lines: list[bytes] = []
+        self.messages: list[dict[str, Any]] = []
         self._over = False
         self.start()
 
     def run(self) -> None:
         while not self._over:
             with contextlib.suppress(TimeoutError):
-                self._lines.append(self._socket.recv(65535))
+                self.messages.append(json.loads(self._socket.recv(65535)))
         self._socket.close()
 
-    @property
-    def messages(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in list(self._lines)]
-
-    def until(self, happens: Callable[[dict[str, Any]], bool], timeout_s: float = 120.0) -> list[dict[str, Any]]:
-        """All that came, when the newest message is such a one."""
-        end = time.monotonic() + timeout_s
-        while not (self._lines and happens(json.loads(self._lines[-1]))):
-            assert time.monotonic() < end, self._lines[-1:]
+    def until(self, happens: Callable[[dict[str, Any]], bool], meanwhile: Callable[[], None] = lambda: None) -> int:
+        """Wait until such a message comes, after all that have come; return its row."""
+        row, end = len(self.messages), time.monotonic() + 120.0
+        while True:
+            if row < len(self.messages):
+                if happens(self.messages[row]):
+                    return row
+                row += 1
+                continue
+            assert time.monotonic() < end, self.messages[-1:]
+            meanwhile()
             time.sleep(0.005)
-        return self.messages
+
+    def has_ended(self) -> bool:
+        """Whether the last commands tell that the robot stands."""
+        last = self.messages[-LAST_COMMANDS:]
+        return all(m["state"] == "stopped" and not any(m["velocity"]) and not any(m["acceleration"]) for m in last)
 
     def close(self) -> None:
         self._over = True
@@ -327,67 +333,60 @@ def receiver() -> Iterator[Receiver]:
     listening.close()
 
 
-def ended(messages: list[dict[str, Any]]) -> bool:
-    """Whether the last of them tell that the robot stands."""
-    last = messages[-LAST_COMMANDS:]
-    return all(m["state"] == "stopped" and not any(m["velocity"]) and not any(m["acceleration"]) for m in last)
-
-
-def play(out: RobotOutput, poses: Sequence[LivePose], shift: float = 0.0) -> None:
-    """At their own pace."""
-    begin = time.monotonic() - poses[0].time
-    for pose in poses:
-        time.sleep(max(0.0, begin + pose.time - time.monotonic()))
-        out.show(pose._replace(time=pose.time + shift))
-
-
-def test_a_source_that_dies_stops_the_robot_by_the_wall_clock(
+def test_a_source_that_dies_stops_the_robot_until_the_person_says_so(
     robot_out, arm: retargeting.Robot, receiver: Receiver
 ) -> None:
-    pose = person(2.0, swing=45.0)
-    out = robot_out(retargeting.CommandStream(arm), receiver.port)
+    """By the wall clock; what a busy machine does to the poses' pace may cost holds on the way, and no limit."""
+    pose = person(4.0, swing=45.0)
+    poses, out = live_poses(pose), robot_out(retargeting.CommandStream(arm), receiver.port)
+    shown = 0
+
+    def show_next() -> None:
+        nonlocal shown
+        out.show(poses[shown % len(poses)]._replace(time=1e4 + shown * 0.005))
+        shown += 1
+
     out.open()
-    time.sleep(0.1)
+    wait_until(lambda: receiver.messages)
     out.start(stream_info(pose))
-    play(out, live_poses(pose)[:150], shift=1e4)
-    time.sleep(1.8)  # nobody calls it any more
-    messages = receiver.messages
-    assert messages[0]["state"] == "hold"
-    assert messages[0]["t"] is None
-    assert messages[0]["reason"] == "waiting for a pose"
-    assert messages[0]["position"] == pytest.approx(arm.rest.tolist())
-    last = messages[-1]
-    assert ended(messages)
-    assert last["t"] == pytest.approx(1e4 + pose.time[149])
-    states = [m["state"] for m in messages]
-    assert [s for k, s in enumerate(states) if k == 0 or states[k - 1] != s] == ["hold", "approach", "hold", "stopped"]
-    held = states.index("stopped") - max(k for k, s in enumerate(states) if s == "approach")
-    assert 60 < held < 130
+    first = receiver.messages[0]
+    assert (first["state"], first["t"], first["reason"]) == ("hold", None, "waiting for a pose")
+    assert first["position"] == pytest.approx(arm.rest.tolist())
+    receiver.until(lambda m: m["state"] == "approach" and max(map(abs, m["velocity"])) > 0.05, show_next)
+    stopped = receiver.until(lambda m: m["state"] == "stopped")  # nobody calls it any more
+    assert receiver.messages[stopped]["t"] == pytest.approx(1e4 + (shown - 1) * 0.005)
+    assert "hold" in [m["state"] for m in receiver.messages[stopped - 60 : stopped]]
+    assert out.describe() == "arm: stopped (no sound pose for 1 s); r, in the start pose, goes on."
+    for _ in range(10):
+        show_next()
+        assert receiver.messages[receiver.until(lambda _: True)]["state"] == "stopped"
+    out.resume()
+    receiver.until(lambda m: m["state"] == "approach", show_next)
     out.close()
-    keeps_its_limits(receiver.until(lambda m: m["n"] + 1 == out.summary().commands, 5.0), arm)
+    wait_until(lambda: len(receiver.messages) == out.summary().commands)
+    assert receiver.has_ended()
+    keeps_its_limits(receiver.messages, arm)
 
 
 def test_the_loop_never_waits_for_the_solver(robot_out, arm: retargeting.Robot, receiver: Receiver) -> None:
+    goes_on = threading.Event()
+
     class SlowStream(retargeting.CommandStream):
         def step(self, now: float, age: float) -> retargeting.Command:
-            time.sleep(0.035)
+            goes_on.wait(120.0)
             return super().step(now, age)
 
     pose = person(1.0)
     out = robot_out(SlowStream(arm), receiver.port)
     out.start(stream_info(pose))
-    took = []
     for one in live_poses(pose):
+        out.show(one)  # returns, though no command can be made
         time.sleep(DT)
-        begin = time.perf_counter()
-        out.show(one)
-        took.append(time.perf_counter() - begin)
-    summary = out.summary()
+    assert receiver.messages == []
+    goes_on.set()
+    receiver.until(lambda m: m["t"] is not None, lambda: out.show(live_poses(pose)[-1]))
     out.close()
-    receiver.until(lambda m: m["n"] + 1 == out.summary().commands, 5.0)
-    assert np.quantile(took, 0.9) < 0.005
-    assert summary.skipped > summary.commands  # two or three of four
-    assert len(receiver.messages) == out.summary().commands
+    wait_until(lambda: len(receiver.messages) == out.summary().commands)
     keeps_its_limits(receiver.messages, arm)
 
 
@@ -412,34 +411,12 @@ def test_the_example_reads_it_and_notices_the_end(robot_out, arm: retargeting.Ro
     assert run.stdout.readline() == f"waiting for commands on 127.0.0.1:{number}; Ctrl-C ends\n"
     out = robot_out(retargeting.CommandStream(arm), number)
     out.open()
-    first_line = run.stdout.readline()
+    lines = [run.stdout.readline()]
     out.close()
-    said = [first_line, *run.communicate(timeout=30)[0].splitlines()]
+    lines += run.communicate(timeout=120)[0].splitlines()
     assert run.returncode == 0
-    assert re.match(r"\d+ hold \[", first_line)
-    if len(said) > 2:  # on a machine that is too busy a tenth of a second may pass before
-        assert " stopped " in said[-2] or " hold " in said[-2]
-    assert said[-1] == "no command: the robot is to be stopped here; waiting"
-
-
-def test_r_goes_on_and_the_person_is_told(robot_out, arm: retargeting.Robot, receiver: Receiver) -> None:
-    pose = person(4.0)
-    poses = live_poses(pose)
-    out = robot_out(retargeting.CommandStream(arm), receiver.port)
-    out.start(stream_info(pose))
-    play(out, poses[:50])
-    receiver.until(lambda message: message["state"] == "stopped")
-    assert out.describe() == "arm: stopped (no sound pose for 1 s); r, in the start pose, goes on."
-    out.show(poses[201])
-    number = receiver.messages[-1]["n"]
-    assert receiver.until(lambda message: message["n"] > number + 5)[-1]["state"] == "stopped"
-    out.resume()
-    out.show(poses[202])
-    receiver.until(lambda message: message["state"] == "approach")
-    out.close()
-    time.sleep(0.1)
-    assert ended(receiver.messages)
-    keeps_its_limits(receiver.messages, arm)
+    assert re.match(r"\d+ hold \[", lines[0])
+    assert lines[-1] == "no command: the robot is to be stopped here; waiting"
 
 
 # The command line ----------------------------------------------------------------------------------------------------
@@ -462,15 +439,14 @@ def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, r
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     receiver.until(lambda m: m["state"] == "approach" and max(map(abs, m["velocity"])) > 0.2)
     process.send_signal(number)
-    out, err = process.communicate(timeout=60)
-    messages = receiver.messages
+    out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     # Skipped on a busy machine; compiled where no test has used the filters before.
     assert all("commands were skipped" in line or "compiling the filters" in line for line in err.splitlines())
-    assert ended(messages)
-    assert messages[-1]["reason"] == "the session has ended"
+    wait_until(receiver.has_ended)
+    assert receiver.messages[-1]["reason"] == "the session has ended"
     assert "arm: " in out
-    keeps_its_limits(messages, retargeting.load_robot(retargeting.find_map(str(urdf))))
+    keeps_its_limits(receiver.messages, retargeting.load_robot(retargeting.find_map(str(urdf))))
 
 
 def test_wrong_robots_are_one_line_before_the_source_opens(

@@ -15,7 +15,8 @@ import time
 
 import pytest
 
-from wepose_pin.live.state import Action, GuideView, Request, SensorStatus, Status
+from wepose_pin.live import Request, SensorStatus, Status
+from wepose_pin.live.state import Action, GuideView
 from wepose_pin.live.terminal import Keyboard, TerminalView
 
 
@@ -121,7 +122,7 @@ def test_the_guide_says_why_and_what_can_be_done() -> None:
     assert lines == ["Result. Too wide.", "    The scale is uncertain.", "    keys: y Accept, q end"]
 
 
-def read_until(master: int, wanted: bytes, seconds: float = 30.0) -> bytes:
+def read_until(master: int, wanted: bytes, seconds: float = 120.0) -> bytes:
     got, until = b"", time.monotonic() + seconds
     while wanted not in got:
         assert select.select([master], [], [], until - time.monotonic())[0], got
@@ -138,22 +139,22 @@ def test_keys_and_the_terminal_afterwards(end: str) -> None:
     master, slave = pty.openpty()
     before = termios.tcgetattr(slave)
     script = textwrap.dedent(SESSION.format(tests=os.path.dirname(__file__)))
-    take = (
-        "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"  # the terminal is ours, and Ctrl-C an interrupt
-    )
+    # The terminal is ours, and Ctrl-C an interrupt, also where the tests run in the background.
+    take = "import fcntl, signal, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)\n"
+    take += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     run = subprocess.Popen(
         [sys.executable, "-c", take + script], stdin=slave, stdout=slave, stderr=slave, start_new_session=True
     )
     try:
         seen = read_until(master, b"latency")
         assert b" s  ready: Tracking." in seen
-        until = time.monotonic() + 20.0
+        until = time.monotonic() + 120.0
         while termios.tcgetattr(slave)[3] & termios.ICANON:
             assert time.monotonic() < until
             time.sleep(0.01)
         os.write(master, b"xR" + (b"q" if end == "q" else b"\x03"))
         seen = read_until(master, b"asked reset quit" if end == "q" else b"KeyboardInterrupt")
-        run.wait(20)
+        run.wait(120)
         assert (run.returncode == 0) is (end == "q")
         assert termios.tcgetattr(slave) == before
     finally:

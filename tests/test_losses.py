@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wepose_pin.live.monitor import SampleCounter, measure_step
+from wepose_pin.live.ticks import SampleCounter, measure_step
 
 RATE_HZ = 100.0
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from listening import NO_PROC, list_listening
-from sampling import collect, connected, find_free_port
+from sampling import collect, connected, find_free_port, wait_until
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import lsl, open_source
@@ -26,6 +25,7 @@ Outlet = Callable[..., Any]
 def pylsl(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     pytest.importorskip("pylsl")
     monkeypatch.delenv("LSLAPICFG", raising=False)
+    monkeypatch.setattr(lsl, "ANSWER_S", 60.0)
     return lsl.configure_pylsl()
 
 
@@ -62,7 +62,7 @@ def test_one_stream_a_sensor(pylsl: ModuleType, outlet: Outlet) -> None:
         stamps = pylsl.local_clock() + np.arange(50) / RATE - 0.5
         send(outlets[:2], rows, stamps)
         samples = collect(source, 50, sensors=2)
-        assert abs(source.clock() - stamps[-1]) < 5.0
+        assert stamps[0] < source.clock() <= pylsl.local_clock()
     for name in source.sensors:
         np.testing.assert_array_equal(np.column_stack([samples[name].gyro_S, samples[name].accel_S]), rows)
         np.testing.assert_array_equal(samples[name].time, stamps)
@@ -106,12 +106,14 @@ def test_a_stream_that_starts_anew_is_taken_up(pylsl: ModuleType, outlet: Outlet
         send([gone, stays], np.ones((5, 6)), pylsl.local_clock() + np.arange(5) / RATE)
         collect(source, 5, sensors=2)
         del gone
-        again, deadline = outlet("back-torso", source_id="torso"), time.monotonic() + 30.0
-        heard: set[str] = set()
-        while heard != {"torso", "head"}:
-            assert time.monotonic() < deadline
+        again, heard = outlet("back-torso", source_id="torso"), list[str]()
+
+        def hears_both() -> bool:
             send([again, stays], np.ones((1, 6)), np.array([pylsl.local_clock()]))
-            heard |= {samples.sensor for samples in source.read(0.02) if samples.sensor == "torso" or "torso" in heard}
+            heard.extend(samples.sensor for samples in source.read(0.02))
+            return "torso" in heard and "head" in heard[heard.index("torso") :]
+
+        wait_until(hears_both)
 
 
 def test_what_is_not_there_is_said_and_one_that_is_there_twice_refused(outlet: Outlet) -> None:
@@ -122,8 +124,7 @@ def test_what_is_not_there_is_said_and_one_that_is_there_twice_refused(outlet: O
     ):
         source = open_source(spec, sensors=sensors)
         source.open()
-        assert not source.connect(0.1)
-        assert source.describe_awaited() == awaited
+        wait_until(lambda: not source.connect(0.1) and source.describe_awaited() == awaited)  # noqa: B023
         source.close()
     outlets.append(outlet("some_head"))
     with pytest.raises(BadSource, match=r"lsl:some: head is in two streams"), connected("lsl:some"):

@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sampling import collect, connected
+from sampling import collect, connected, wait_until
 
-from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import mti, open_source
 
 serial = pytest.importorskip("serial")
@@ -125,6 +124,7 @@ def plugged(tmp_path: Path) -> Iterator[Plug]:
 
 def test_two_sensors_configured_to_a_rate(plugged: Plug) -> None:
     one, two = plugged("one", streaming=True), plugged("two")
+    begin = time.monotonic()
     with connected(f"mti:{one.link}=torso,{two.link}=head@50") as source:
         assert source.sensors == ("torso", "head")
         assert source.rate_hz == 50
@@ -135,8 +135,8 @@ def test_two_sensors_configured_to_a_rate(plugged: Plug) -> None:
         assert device.asked[1][1] == bytes.fromhex("1060FFFF4020003280200032")
         np.testing.assert_array_equal(samples[name].gyro_S, np.tile(GYRO, (len(samples[name].time), 1)))
         np.testing.assert_array_equal(samples[name].accel_S, np.tile(ACCEL, (len(samples[name].time), 1)))
-        np.testing.assert_allclose(np.diff(samples[name].time), 0.02, rtol=0.0101)
-        assert abs(samples[name].time[-1] - source.clock()) < 1.0
+        assert np.median(np.diff(samples[name].time)) == pytest.approx(0.02, rel=0.0101)
+        assert begin < samples[name].time[-1] <= source.clock()
     assert source.problems == {}
 
 
@@ -146,17 +146,18 @@ def test_the_outputs_that_a_device_has_at_a_rate(plugged: Plug) -> None:
     with connected(f"mti:{device.link}=torso@1000", baud=921600) as source:
         samples = collect(source, 500)["torso"]
     assert {kind for kind, _ in device.items} == {0x4040, 0x8040}
-    assert np.diff(samples.time).mean() == pytest.approx(0.001, rel=0.0101)
+    assert np.median(np.diff(samples.time)) == pytest.approx(0.001, rel=0.0101)
     with connected(f"mti:{plain.link}=torso@400"):
         assert plain.items == [(0x4020, 400), (0x8020, 400)]
     with connected(f"mti:{plain.link}=torso"):
         assert plain.items == [(0x4020, 100), (0x8020, 100)]
     slower = plugged("three", most={0x4020: 100, 0x8020: 100, 0x4040: 1000, 0x8040: 800})
-    with (
-        pytest.raises(BadSource, match=r"at 1000 Hz; it offers .*RateOfTurnHR at 800 Hz, .*; choose a rate"),
-        connected(f"mti:{slower.link}=torso@1000"),
-    ):
-        pass
+    source = open_source(f"mti:{slower.link}=torso@1000")
+    source.open()
+    wait_until(
+        lambda: source.describe_awaited().endswith("it has no 1000 Hz, but 800 Hz: choose a rate that it has, as @800")
+    )
+    source.close()
 
 
 def test_noise_is_counted_and_no_sample_lost(plugged: Plug) -> None:
@@ -165,23 +166,24 @@ def test_noise_is_counted_and_no_sample_lost(plugged: Plug) -> None:
     with connected(f"mti:{device.link}=torso@100") as source:
         samples = collect(source, 60)["torso"]
     assert len(samples.time) >= 60
-    np.testing.assert_allclose(np.diff(samples.time), 0.01, rtol=0.0101)
+    assert np.diff(samples.time).max() < 0.015  # none is missing
     assert source.problems["damaged packets and errors of torso"] > 0
 
 
 def test_a_port_that_vanishes_is_taken_up_again(plugged: Plug) -> None:
     """The other sensor goes on; the one that comes back is configured anew, its clock begins anew."""
     gone, stays = plugged("one"), plugged("two")
+    begin = time.monotonic()
     with connected(f"mti:{gone.link}=torso,{stays.link}=head@100") as source:
         collect(source, 20, sensors=2)
         gone.pull()
+        wait_until(lambda: source.read(0.1) and source.problems.get("connections lost to torso"))
         assert len(collect(source, 30)["head"].time) >= 30
-        assert source.problems["connections lost to torso"] == 1
         gone.measuring, gone.ticks = False, 0
         gone.plug()
         samples = collect(source, 20, sensors=2)["torso"]
         assert len(samples.time) >= 20
-        assert abs(samples.time[-1] - source.clock()) < 0.5
+        assert begin < samples.time[-1] <= source.clock()
         assert [mid for mid, _ in gone.asked] == [0x30, 0xC0, 0x10] * 2
 
 
@@ -200,22 +202,22 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
     tmp_path: Path, plugged: Plug, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mti, "ANSWER_S", 0.05)
-    before = threading.active_count()
+    before = set(threading.enumerate())
     source = open_source(f"mti:{tmp_path / 'one'}=torso@100")
     place = f"the MTi of torso at {tmp_path / 'one'}: "
     source.open()
-    assert not source.connect(1.0)
-    assert source.describe_awaited() == f"{place}cannot open the port (No such file or directory)"
+    wait_until(lambda: source.describe_awaited() == f"{place}cannot open the port (No such file or directory)")
+    assert not source.connect(0.1)
     device = plugged("one")
     device.deaf = True
-    assert not source.connect(3.0)
-    assert source.describe_awaited().startswith(f"{place}no MTi answers at 115200 baud")
+    wait_until(lambda: source.describe_awaited().startswith(f"{place}no MTi answers at 115200 baud"))
     device.deaf = False
     source.close()
+    monkeypatch.setattr(mti, "ANSWER_S", 0.5)
     for _ in range(2):  # the port is free again after each
         with connected(source):
             assert collect(source, 5)
-    assert threading.active_count() == before + 1  # the device
+    assert len(set(threading.enumerate()) - before) == 1  # the device
 
 
 # Frames and packets --------------------------------------------------------------------------------------------------

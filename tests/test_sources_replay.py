@@ -52,11 +52,12 @@ def test_every_sample_comes_once_and_in_order(speed: float, pause_s: float) -> N
 
 def test_the_clock_runs_at_the_speed() -> None:
     source = ReplaySource(recording(), 10.0)
+    before = time.monotonic()
     source.open()
-    begin, host = source.clock(), time.monotonic()
+    after = time.monotonic()
     time.sleep(0.05)
-    assert source.clock() - begin == pytest.approx(10.0 * (time.monotonic() - host), abs=0.05)
-    assert begin == pytest.approx(20.0, abs=0.1)
+    least, now, most = time.monotonic() - after, source.clock(), time.monotonic() - before
+    assert 20.0 + 10.0 * least <= now <= 20.0 + 10.0 * most
 
 
 def test_no_sample_in_a_marked_gap() -> None:
@@ -69,7 +70,7 @@ def test_no_sample_in_a_marked_gap() -> None:
 
 
 def test_nothing_due_is_nothing() -> None:
-    source = ReplaySource(recording(), 0.01)
+    source = ReplaySource(recording(), 1e-6)
     source.open()
     assert source.read(0.0) is not None  # the first sample
     assert source.read(0.0) == []
@@ -106,8 +107,6 @@ def test_measured_orientations_come_as_six_numbers() -> None:
         ("udp:9000,gyro_unit=rpm", {}, "gyro_unit 'rpm' is not known; there is: rad/s, deg/s"),
         ("udp:9000,unit=g", {}, "'unit=g' is no unit"),
         ("slimevr:0.0.0.0:70000", {}, "70000: a port or HOST:PORT"),
-        ("slimevr:,4c:11=torso,4c:12=torso", {}, "'4c:12=torso': each device and each segment is named once"),
-        ("slimevr:,torso", {}, "'torso' is no DEVICE=SEGMENT, as 4c:11:ae:00:00:01/0=torso"),
     ],
 )
 def test_a_wrong_spec_says_what_is_right(spec: str, options: dict, words: str) -> None:

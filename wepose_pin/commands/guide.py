@@ -66,7 +66,7 @@ def run_guide(
     from ..calibration.protocols import split_protocol
     from ..live.assignment import read_segments, write_segments
     from ..live.guide import Calibrated, Guide, GuideOptions
-    from ..live.session import open_and_wait, warm_up
+    from ..live.loop import open_and_wait, warm_up
     from ..live.steps import STATURE, make_steps
     from ..readers import load_session
     from ..readers.mvnx import read_subject

@@ -160,23 +160,24 @@ def live(
     from ..calibration.protocols import GUIDED
     from ..compilation import announce_compilation
     from ..live import find_setup, open_source, run_session
+    from ..live.encoder import RobotFigure
+    from ..live.loop import warm_up
     from ..live.robot import connect_robot, read_robot
-    from ..live.session import warm_up
     from ..live.setup import build_subject_model, check_mounts
     from ..live.terminal import Keyboard, TerminalView
     from ..retargeting.targets import check_person_arms
     from .guide import make_guide_folder, run_guide
 
-    for option, given in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
-        if given is not None and not guide:
+    for option, value in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
+        if value is not None and not guide:
             raise BadOption(f"--{option}: goes with --guide, which is not given")
     usual = {"udp": udp, "lsl": lsl}
-    senders = [f"{name}:{given}" for name, given in usual.items() if given is not None] + list(output or ())
+    senders = [f"{name}:{value}" for name, value in usual.items() if value is not None] + list(output or ())
     announce_compilation()  # a stream is waiting
     # A wrong robot is found before the person does anything.
-    following = None if robot is None else read_robot(robot)
-    if following is not None and guide:
-        check_person_arms(following.robot, load_protocol(protocol or GUIDED).needs)
+    robot_options = None if robot is None else read_robot(robot)
+    if robot_options is not None and guide:
+        check_person_arms(robot_options.robot, load_protocol(protocol or GUIDED).needs)
     if subject is not None and not accept_failed:
         load_subject(subject).check_quality()
     replays = source.startswith("replay:")
@@ -216,22 +217,23 @@ def live(
                     return Live(None, None)
                 (samples, worn), record = guided, record or _name_recording(folder)
                 body = build_subject_model(worn, model, samples.sensors)
-            if following is not None:
+            if robot_options is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
-                driven = connect_robot(following, samples.sensors, worn.subject, factor, body.table)
+                driven = connect_robot(robot_options, samples.sensors, worn.subject, factor, body.table)
                 if not driven.stream.checks_contact:
                     print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
-            if served is not None and (guide or driven is not None):
-                served.set_body(body, None if driven is None else driven.figure(body))
-            if driven is not None:
-                outputs.insert(0, driven)
+            if served is not None and driven is not None:
+                served.set_body(body, RobotFigure(driven.robot, body, driven.read_position))
+            elif served is not None and guide:
+                served.set_body(body)
             outputs += _open_senders(senders)
             if driven is not None:
+                outputs.insert(0, driven)
                 warm_up(method)  # compiles before commands are due
                 driven.open()
             summary = run_session(
                 samples,
-                worn.with_model(model),
+                worn.as_recorded(model),
                 method=method,
                 model=body,
                 record=record,
@@ -268,9 +270,7 @@ def _print_end(ended: Live, record: Path | None) -> None:
         title = f"{robot.robot}: {robot.commands} commands, none with a pose"
         if robot.share:
             shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
-            p50, p99 = (1e3 * np.quantile(robot.step, (0.5, 0.99))).tolist()
-            took = f"each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
-            title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}; {took}"
+            title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}"
         rows = [
             (side, *(f"{1e3 * np.quantile(error, share):.1f}" if len(error) else "–" for share in (0.5, 0.9)))
             for side, error in robot.error.items()
@@ -302,15 +302,13 @@ def _open_stream(source: str, worn: SensorSetup, model: BodyModel, folder: Path 
 
 def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_browser: bool) -> LivePage:
     """Serve the page, and say where."""
-    from ..live.addresses import LOOPBACK
     from ..live.page import LivePage
+    from ..live.sources.udp import LOOPBACK
 
     page = LivePage(model, host=host or LOOPBACK, port=port, title=title)
     page.open()
-    if "token=" in page.url:
-        say(f"Page: {page.url}  (whoever has this address can watch and press the page's buttons)")
-    else:
-        say(f"Page: {page.url}  (this machine only)")
+    everybody = "whoever has this address can watch and press the page's buttons"
+    say(f"Page: {page.url}  ({everybody if page.token else 'this machine only'})")
     if in_browser:
         import webbrowser
 

@@ -5,8 +5,7 @@ Outputs load when they are used: `page` for the browser, `terminal`, `outputs` f
 
 from __future__ import annotations
 
-from .loop import LiveLoop, SessionSummary
-from .session import run_session
+from .loop import LiveLoop, SessionSummary, run_session
 from .setup import SensorSetup, find_setup, read_setup
 from .sources import open_source
 from .state import LivePose, Output, Request, SensorStatus, Status, StreamInfo

@@ -32,22 +32,18 @@ class ShakeDetector:
     def push(self, samples: Iterable[Samples], measured: Collection[str] = ()) -> None:
         """Add samples of any sensors; those of `measured` are orientations."""
         for chunk in samples:
+            squares = np.sum(chunk.gyro_S**2, axis=1)
+            if chunk.sensor in measured:  # from each orientation to the next
+                quat = unpack_orientations(chunk.gyro_S, chunk.accel_S)
+                last_time, last_quat = self._last.get(chunk.sensor, (chunk.time[0], quat[0]))
+                self._last[chunk.sensor] = float(chunk.time[-1]), quat[-1]
+                cosine = np.abs(np.sum(np.concatenate([last_quat[None], quat[:-1]]) * quat, axis=1))
+                step_s = np.maximum(np.diff(chunk.time, prepend=last_time), SHORTEST_STEP_S)
+                squares = (2.0 * np.arccos(np.minimum(cosine, 1.0)) / step_s) ** 2
             recent = self._recent.setdefault(chunk.sensor, deque())
-            is_measured = chunk.sensor in measured
-            squares = self._square_rates(chunk) if is_measured else np.sum(chunk.gyro_S**2, axis=1)
             recent.extend(zip(chunk.time.tolist(), squares.tolist(), strict=True))
-            while recent and recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
+            while recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
                 recent.popleft()
-
-    def _square_rates(self, chunk: Samples) -> np.ndarray:
-        """Square the rates (n,) [rad²/s²] from each orientation to the next."""
-        quat, time_s = unpack_orientations(chunk.gyro_S, chunk.accel_S), chunk.time
-        last_time, last_quat = self._last.get(chunk.sensor, (time_s[0], quat[0]))
-        self._last[chunk.sensor] = float(time_s[-1]), quat[-1]
-        before = np.concatenate([last_quat[None], quat[:-1]])
-        half_angle = np.arccos(np.minimum(np.abs(np.sum(before * quat, axis=1)), 1.0))
-        step_s = np.maximum(np.diff(time_s, prepend=last_time), SHORTEST_STEP_S)
-        return np.asarray((2.0 * half_angle / step_s) ** 2)
 
     def find(self, candidates: Sequence[str]) -> str | None:
         """The candidate that is shaken; None: none, several, or those of the last shake still move."""
@@ -55,11 +51,13 @@ class ShakeDetector:
         if not self.is_calm:
             self.is_calm = max(rates.values(), default=0.0) < CALM_RATE
             return None
-        ranked = sorted((rates.get(sensor, 0.0), sensor) for sensor in candidates)[-2:]
-        if not ranked or ranked[-1][0] < SHAKE_RATE or (len(ranked) > 1 and ranked[1][0] < SHAKE_RATIO * ranked[0][0]):
+        second, first = sorted([(0.0, ""), (0.0, ""), *((rates.get(sensor, 0.0), sensor) for sensor in candidates)])[
+            -2:
+        ]
+        if first[0] < max(SHAKE_RATE, SHAKE_RATIO * second[0]):
             return None
         self.is_calm = False
-        return ranked[-1][1]
+        return first[1]
 
     def list_moving(self) -> list[str]:
         return [sensor for sensor, rate in self._find_rates().items() if rate > CALM_RATE]
@@ -69,7 +67,7 @@ class ShakeDetector:
         return {
             sensor: float(np.sqrt(np.mean([square for _, square in recent])))
             for sensor, recent in self._recent.items()
-            if recent and recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
+            if recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
         }
 
 

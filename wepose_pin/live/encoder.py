@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,7 @@ class RobotFigure:
         self.meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
 
     def points(self) -> np.ndarray:
+        """Some points (n, 3) [m] of its surface in W."""
         placed = dict(zip(self.links, self.place(), strict=True))
         at = [(mesh.vertices, placed[mesh.link]) for mesh in self.meshes]
         return np.concatenate([vertices @ row[:9].reshape(3, 3).T + row[9:] for vertices, row in at])[::50]
@@ -59,17 +60,18 @@ class PoseEncoder:
     """Encodes poses for the page, with the robot beside the person if there is one."""
 
     def __init__(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
+        self.identity = secrets.token_hex(8)  # of the page that draws its frames
         self.visuals, self.robot = visible(model.visuals), robot
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
         self.links = self.body_links + (() if robot is None else robot.links)  # in the order of the frames
         self.newest: LivePose | None = None  # to draw; None: the N-pose
         self.info: StreamInfo | None = None  # of the poses; None before the start
-        self.angles = AngleCurves()
         self._model, self._lock = model, threading.Lock()  # the page encodes in a thread of its own
         self._frames = [model.pin.getFrameId(link) for link in self.body_links]
         data = place_n_pose(model)
         self._neutral = _stack([data.oMf[frame] for frame in self._frames])
         self._known = np.ones(len(self._frames), dtype=bool)
+        self._curve_poses, self._curve_due = deque[LivePose](maxlen=MAX_CURVE_POSES), -math.inf
 
     def start(self, info: StreamInfo) -> None:
         model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
@@ -86,8 +88,15 @@ class PoseEncoder:
             self._known = np.array([link in known for link in self.body_links], dtype=bool)
             self._sensors = np.array(sensors, dtype=int)
             self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.draw.paths]
-            self.newest = None  # it may be of another stream
-            self.angles, self.info = AngleCurves(info.segments), info
+            self.newest, self.info = None, info  # the newest one may be of another stream
+            self._curve_poses.clear()
+
+    def show(self, pose: LivePose) -> None:
+        """Take the newest pose, also for the joint angles unless it is within a step of `CURVE_RATE_HZ`."""
+        self.newest = pose
+        if pose.time >= self._curve_due:
+            self._curve_due = pose.time + 1.0 / CURVE_RATE_HZ
+            self._curve_poses.append(pose)
 
     def encode(self, pose: LivePose | None) -> bytes:
         """The frame of a pose, None: the N-pose, as `page` describes it; NaN is what is not known."""
@@ -105,29 +114,13 @@ class PoseEncoder:
             placements = np.concatenate([placements, self.robot.place()])
         return np.array(time, "<f8").tobytes() + placements.tobytes() + points.tobytes() + lost.tobytes()
 
-
-class AngleCurves:
-    """Joint angles of the poses since they were last taken, together: one by one they cost ten times as much."""
-
-    def __init__(self, segments: tuple[str, ...] = ()) -> None:
-        self._segments = segments
-        self._poses: deque[LivePose] = deque(maxlen=MAX_CURVE_POSES)
-        self._due = -math.inf
-
-    def push(self, pose: LivePose) -> None:
-        """Add a pose, unless the last one was less than a step of `CURVE_RATE_HZ` before."""
-        if not self._due - 1.0 < pose.time < self._due:
-            self._due = pose.time + 1.0 / CURVE_RATE_HZ
-            self._poses.append(pose)
-
-    def take(self) -> dict[str, Any] | None:
+    def take_angles(self) -> dict[str, Any] | None:
         """Times [s], and joint → angle → values [deg], of the poses since the last call; None: there are none."""
-        poses = [self._poses.popleft() for _ in range(len(self._poses))]
-        poses = [pose for pose, after in pairwise(poses) if pose.time < after.time] + poses[-1:]
-        if not poses:
+        poses = [self._curve_poses.popleft() for _ in range(len(self._curve_poses))]
+        if not poses or self.info is None:
             return None
         time = np.array([pose.time for pose in poses])
-        quat_WL = {name: np.array([pose.quat_WL[k] for pose in poses]) for k, name in enumerate(self._segments)}
+        quat_WL = {name: np.array([pose.quat_WL[k] for pose in poses]) for k, name in enumerate(self.info.segments)}
         try:
             joints = joint_angles(Pose(time, quat_WL, {})).joints
         except WeposeError:  # no two segments make a joint

@@ -10,26 +10,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..body import BodyModel
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..body import DEFAULT_BODY, BodyModel
+from ..body.kinematics import KinematicsSolver
 from ..calibration import Calibration, Protocol
+from ..errors import BadOption
 from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
+from ..simulation import simulate
 from ..writers.live_log import LiveLog
 from .assignment import AssignedSource
-from .demonstration import RATE_HZ, Demonstration
-from .monitor import SensorMonitor
 from .setup import SensorSetup
 from .sources.base import Source
-from .stage import Stage
-from .state import Action, GuideStep, GuideView, Output, Status, join_names
-from .ticks import TickStream
+from .state import Action, GuideStep, GuideView, LivePose, Output, Stage, Status, StreamInfo, join_names
+from .ticks import SensorMonitor, TickStream
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
+FIGURE_RATE_HZ = 30.0
+MOTION_S = 14.0  # [s] of the motion of a protocol's part; it is drawn again and again
+LEAD_S = 2.0  # [s] before the phase in which the figure takes its place
+SHAKE_HZ, SHAKE_ANGLE = 2.5, 0.45  # of a shaken segment; angle in rad
 
 
 class Calibrated(NamedTuple):
@@ -90,7 +98,7 @@ class Guide(Stage):
         self, source: Source, options: GuideOptions, steps: Sequence[Step], outputs: Sequence[Output] = ()
     ) -> None:
         super().__init__(source, outputs)
-        self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor()
+        self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor(source)
         self._figure, self._figure_due = Demonstration(options.model, options.protocol) if outputs else None, 0.0
         self.order = tuple(options.model.table.segments)  # segments in the order of the body
         self.needs = options.protocol.needs  # segments that must carry a sensor
@@ -113,12 +121,8 @@ class Guide(Stage):
         return self.steps[self._index]
 
     @property
-    def sending(self) -> list[str]:
-        return self.monitor.sending
-
-    @property
     def silent(self) -> list[str]:
-        return self.monitor.list_silent(self.segments or self.sending, self.now, SILENCE_S)
+        return self.monitor.list_silent(self.segments or self.monitor.sending, self.now, SILENCE_S)
 
     @property
     def actions(self) -> tuple[Action, ...]:
@@ -148,7 +152,7 @@ class Guide(Stage):
         self._go_on(None)
         now = time.monotonic()
         if self._figure is not None and now >= self._figure_due:
-            self._figure_due = now + 1.0 / RATE_HZ
+            self._figure_due = now + 1.0 / FIGURE_RATE_HZ
             pose = self._figure.pose(self._view, now)
             for output in self.outputs:
                 output.demonstrate(pose, self._figure.info)
@@ -181,10 +185,9 @@ class Guide(Stage):
             self._running = self.step.run(self, turn)
             try:
                 self._view = next(self._running)
+                return
             except StopIteration as ended:  # there is nothing to do in it
                 turn = ended.value
-            else:
-                return
 
     def begin_attempt(self) -> Attempt:
         """Begin to record, unless a recording of these sensors runs."""
@@ -192,9 +195,7 @@ class Guide(Stage):
             self.attempts += 1
             while (path := self.options.folder / f"calibration-{self.attempts}.mcap").exists():
                 self.attempts += 1
-            source = self.assign_source()
-            header = self.options.setup.header(source.sensors, source.orientations) | {"method": self.options.method}
-            self.attempt, self._postponed = Attempt(path, source, header), []
+            self.attempt, self._postponed = Attempt(path, self.assign_source(), self.options), []
         return self.attempt
 
     def assign_source(self) -> AssignedSource:
@@ -215,23 +216,25 @@ class Guide(Stage):
 
     def build_status(self) -> Status:
         sensors = []
-        for name, known in sorted(self.monitor.list_statuses(self.now, self.source.batteries).items()):
+        for name, known in sorted(self.monitor.update(self.now).items()):
             segment = self.segments.get(name, name)
             label = name if segment == name else f"{segment} ({name})"
             sensors.append(known._replace(segment=label, lost=name in self.silent))
-        status = Status("guide", "", 0.0, self.now, tuple(sensors), problems=dict(self.source.problems))
+        status = Status("waiting", "The subject is saved. Tracking begins.", 0.0, self.now, tuple(sensors))
+        status = status._replace(problems=dict(self.source.problems))
         if self.is_over:
-            return status._replace(state="waiting", message="The subject is saved. Tracking begins.")
+            return status
         view = self.view()
-        return status._replace(message=view.sentence, progress=view.progress, actions=self.actions, guide=view)
+        status = status._replace(state="guide", message=view.sentence, progress=view.progress)
+        return status._replace(actions=self.actions, guide=view)
 
     def describe_problems(self) -> str:
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
         silent = [self.segments.get(name, name) for name in self.silent]
         if silent:
-            every = len(silent) == len(self.segments or self.sending) > 1
+            every = len(silent) == len(self.segments or self.monitor.sending) > 1
             return f"No samples from {'any sensor' if every else join_names(silent)}. Switched on and in reach?"
-        return self.monitor.describe_wrong_unit(self.source)
+        return self.monitor.wrong_unit
 
 
 class Attempt:
@@ -240,11 +243,11 @@ class Attempt:
     The file gives the same samples and phases again, so that a calibration of it has the same numbers.
     """
 
-    def __init__(self, path: Path, source: AssignedSource, header: Mapping[str, Any]) -> None:
-        self.log, self._source = LiveLog(path, header), source
-        self.stream = TickStream(source.sensors, source.rate_hz, log=self.log, orientations=source.orientations)
-        self._header, self._markers = dict(header), Markers()
-        self._ticks: list[Ticks] = []
+    def __init__(self, path: Path, source: AssignedSource, options: GuideOptions) -> None:
+        self._header = options.setup.header(source.sensors, source.orientations) | {"method": options.method}
+        self._source, self.log = source, LiveLog(path, self._header)
+        self.stream = TickStream(source, log=self.log)
+        self._markers, self._ticks = Markers(), list[Ticks]()
 
     @property
     def newest(self) -> float:
@@ -278,7 +281,40 @@ class Attempt:
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
         header = self._header | {"sensors": self.segments, "phases": self._phases()}
-        return check_recording(build_recording(header, self.stream.clock.rate_hz, self._ticks, None, self.log.path))
+        return check_recording(build_recording(header, self.stream.rate_hz, self._ticks, None, self.log.path))
 
     def _phases(self) -> dict[str, Any]:
         return self._markers.phases(float(self._ticks[0].time[0]), self.newest) if self._ticks else {}
+
+
+class Demonstration:
+    """What the figure of the page does to show a step; that of a body without a simulated protocol stands still."""
+
+    def __init__(self, model: BodyModel, protocol: Protocol) -> None:
+        self._motion, self._phases = dict[str, np.ndarray](), dict[str, tuple[float, float]]()
+        for task in (protocol.name, "clasp") if model.table.name == DEFAULT_BODY else ():
+            with suppress(BadOption):  # a protocol of one's own is shown as a clasp
+                motion_s, rate_hz = MOTION_S * len(task.split("+")), FIGURE_RATE_HZ
+                motion = simulate(model.lengths, seed=1, rate_hz=rate_hz, clasp_s=motion_s, circles=0, protocol=task)
+                self._motion = motion.quat_WL
+                self._phases = {name: spans[0] for name, spans in motion.phases.items() if spans}
+                break
+        self.segments = tuple(model.table.needed)
+        self._kinematics = KinematicsSolver(model, self.segments)
+        self.info = StreamInfo(self.segments, self._kinematics.points, FIGURE_RATE_HZ)  # of the poses
+
+    def pose(self, view: GuideView, time: float) -> LivePose:
+        """The figure at a time [s]: the start pose, the motion of a phase, or one segment that is shaken."""
+        quat_WL = np.tile([0.0, 0.0, 0.0, 1.0], (len(self.segments), 1))
+        dimmed = np.zeros(len(self.segments), dtype=bool)
+        if view.demonstration in self._phases:
+            first, last = self._phases[view.demonstration]
+            row = round(FIGURE_RATE_HZ * (first - LEAD_S + time % (last - first + LEAD_S)))
+            quat_WL = np.array([self._motion[name][row] for name in self.segments])
+        elif view.highlight in self.segments:
+            angle = SHAKE_ANGLE * np.sin(2.0 * np.pi * SHAKE_HZ * time) * (time % 2.0 < 1.2)
+            k = self.segments.index(view.highlight)
+            quat_WL[k] = Rotation.from_rotvec([0.0, -abs(angle), 0.0]).as_quat()
+            dimmed = np.arange(len(self.segments)) != k
+        points = self._kinematics.compute_points(quat_WL)
+        return LivePose(time, quat_WL, points, np.full(len(quat_WL), np.nan), dimmed, 0.0)

@@ -1,4 +1,4 @@
-"""The live loop: samples of a source → ticks → poses → outputs and the recording."""
+"""A live session: samples of a source → ticks → poses → outputs and the recording."""
 
 from __future__ import annotations
 
@@ -14,32 +14,35 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..body import BodyModel
+from ..body import BodyModel, load_table
 from ..body.covariance import compute_axis_std
 from ..body.kinematics import KinematicsSolver
 from ..body.soft_tissue import SoftTissueCorrection
 from ..body.start_pose import compute_start_configuration
 from ..body.table_file import check_segments
 from ..diagnostics import Diagnostic
-from ..errors import BadModel, BadSession, WeposeError
+from ..errors import BadModel, BadSession, ExistingOutput, WeposeError
 from ..filters import BEST
 from ..readers.live_log import LONGEST_TEXT, build_recording
-from ..recording.arrivals import COUNTS, CUT_OFF, DUPLICATE, LATE, Samples, Ticks
+from ..recording import ImuSensor, Recording
+from ..recording.arrivals import COUNTS, CUT_OFF, LATE, Samples, Ticks
+from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker, TrackOptions
+from ..tracking.heading_problem import CAUSAL_KNOT_S
 from ..tracking.segments import SegmentEstimator
 from ..writers.live_log import LiveLog
-from .monitor import SensorMonitor, check_units
-from .setup import SensorSetup, build_subject_model
+from ..writers.result import versions
+from .setup import SensorSetup, build_subject_model, check_mounts
 from .sources.base import Source
-from .stage import Stage
-from .state import Action, LivePose, Output, SensorStatus, Status, StreamInfo, join_names
-from .ticks import StartPoseSearch, TickStream
+from .sources.replay import ReplaySource
+from .state import QUIT, Action, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
+from .ticks import SensorMonitor, StartPoseSearch, TickStream, check_units
 
+CONNECT_S = 0.2  # [s] for which a source searches before the user is asked again
 SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 100_000  # newest latencies in the summary
 SHOWN_LATENCIES = 1000  # and in the status
-TAKE = "take_"  # the names of takes begin so
 
 RESET = Action("reset", "Reset headings", "r")
 BEGIN_TAKE = Action("take", "Begin take", "t")
@@ -61,19 +64,10 @@ class SessionSummary(NamedTuple):
 
 
 class LiveLoop(Stage):
-    """One session, from the source's first sample to its end.
+    """One session, from the first sample of an open source to its end; `run` closes source and `log`.
 
-    Parameters
-    ----------
-    source : an open source; `run` closes it
-    model : a body; None: that of the setup, with the subject's lengths
-    log : the recording; `run` closes it
-    begin : time [s] of the first tick; None: when every sensor has sent a sample
-
-    Raises
-    ------
-    WeposeError
-        A method that cannot run live; mounts that are not known.
+    `model` None is the body of the setup, with the subject's lengths. `begin` is the time [s] of the first tick; None:
+    when every sensor has sent a sample. Raises `WeposeError` where the method cannot run live.
     """
 
     def __init__(
@@ -96,20 +90,18 @@ class LiveLoop(Stage):
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
         self._soft_tissue = SoftTissueCorrection(self.model.table, self.model.tissue_means, tuple(source.sensors))
-        self._monitor = SensorMonitor()
-        self._stream = TickStream(source.sensors, source.rate_hz, begin, log, source.orientations)
+        self._monitor, self._stream = SensorMonitor(source), TickStream(source, begin, log)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
         self._estimator: SegmentEstimator | None = None  # from when the start pose is found
         # Where stated phases begin (True) and end, in order of time; a phase holds its first second and its last.
         spans = [(name, first, last) for name, spans in setup.phases.items() for first, last in spans]
         edges = [(first - 1e-9, name, True) for name, first, _ in spans]
         self._edges = deque(sorted(edges + [(last + 1e-9, name, False) for name, _, last in spans]))
-        self._heading_reset_time = 0.0
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
         self._latency: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s]
-        self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
-        self._open_phases: list[str] = []
+        self._poses, self._first_pose, self._last_pose, self._heading_reset_time = 0, 0.0, 0.0, 0.0
+        self._open_phases: dict[str, str] = {}  # name of the action that began it and ends it → phase
         self._takes = 0
         self._end_message = ""  # empty: it goes on
         self._diagnostics: tuple[Diagnostic, ...] = ()
@@ -117,12 +109,7 @@ class LiveLoop(Stage):
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
         """Run until the source ends, the user quits, or `should_stop` returns True.
 
-        Without a start pose there is nothing to track, and no recording remains.
-
-        Raises
-        ------
-        BadData
-            The start pose shows that a sensor sends another unit.
+        Without a start pose no recording remains. Raises `BadData` where it shows that a sensor sends another unit.
         """
         switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -146,7 +133,19 @@ class LiveLoop(Stage):
                     self.log = None
             for output in self.outputs:
                 output.close()
-        return self._summarize()
+        log, sending = self.log, self._monitor.sending
+        return SessionSummary(
+            self._poses,
+            self._last_pose - self._first_pose,
+            {
+                name: dict(zip(COUNTS, row, strict=True)) | {"lost": sending[name].missing if name in sending else 0}
+                for name, row in zip(self.source.sensors, self._read_counts().tolist(), strict=True)
+            },
+            np.array(self._latency),
+            self._diagnostics,
+            "" if log is None else log.problem,
+            None if log is None else log.path,
+        )
 
     # Samples to poses ------------------------------------------------------------------------------------------------
 
@@ -155,16 +154,14 @@ class LiveLoop(Stage):
         self._monitor.push(samples, self.source.sensors if self._estimator else self.source.orientations)
         for ticks in self._stream.push(samples):
             pose = self._track(ticks) or pose
+        if self.log is not None:
+            self.log.flush_if_due()  # before it is shown: a pose that others know is in the file soon
         if pose is not None:
             for output in self.outputs:
                 output.show(pose)
-        if self.log is not None:
-            self.log.flush_if_due()
 
     def _track(self, ticks: Ticks) -> LivePose | None:
         """Track these ticks, log every pose, and return the last one; None before tracking starts."""
-        if not len(ticks.time):
-            return None
         row, estimator, quat_WL = 0, self._estimator, None
         if estimator is None:
             self._search = self._search or StartPoseSearch(self._stream, self.setup, self.model.table)
@@ -193,7 +190,7 @@ class LiveLoop(Stage):
 
     def _update_std(self, estimator: SegmentEstimator, tick: int) -> None:
         """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
-        period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))  # ticks from one to the next
+        period = max(1, round(self.STATUS_PERIOD_S * self._stream.rate_hz))  # ticks from one to the next
         if tick % period == 0:
             self._covariance = estimator.covariance_gradually()
         for covariance in itertools.islice(self._covariance, math.ceil((len(self._std) + 2) / period)):
@@ -202,7 +199,7 @@ class LiveLoop(Stage):
 
     def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> SegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
-        rate_hz = self._stream.clock.rate_hz
+        rate_hz = self._stream.rate_hz
         header = self.setup.header(self.source.sensors, self.source.orientations)
         recording = build_recording(header, rate_hz, search.ticks, (begin, end), last=end)
         diagnostics = check_units(recording, self.source)
@@ -212,7 +209,7 @@ class LiveLoop(Stage):
         assert estimator is not None
         search.ticks = []
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
-        self._first_pose = self._heading_reset_time = float(recording.time[-1])
+        self._first_pose = self._last_pose = self._heading_reset_time = float(recording.time[-1])
         self._log_event("start", begin=begin, end=end)
         info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
         for output in self.outputs:
@@ -232,77 +229,70 @@ class LiveLoop(Stage):
         if self._estimator is None or self.log is None:
             return (RESET,)
         marks = [BEGIN_TAKE, BEGIN_PHASE]
-        for k, name in enumerate(map(self._find_open, (True, False))):
-            if name:
-                marks[k] = marks[k]._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
+        for k, action in enumerate(marks):
+            if name := self._open_phases.get(action.name):
+                marks[k] = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
         return (RESET, *marks, MARK, MARK_TEXT)
-
-    def _find_open(self, is_take: bool) -> str:
-        """The phase that was begun and not ended, and is a take or none; empty: there is none."""
-        return next((phase for phase in self._open_phases if phase.startswith(TAKE) == is_take), "")
 
     def do(self, action: Action, text: str) -> None:
         text = text[:LONGEST_TEXT]
         if action.name == RESET.name:
-            if self._estimator is not None:
+            if self._estimator is not None and self._stream.clock is not None:
                 self._estimator.reset_headings()
-                self._heading_reset_time = self._stream.clock.newest
+                self._heading_reset_time = self._stream.newest
                 self._log_event("reset", tick=self._stream.clock.next_tick)
             for output in self.outputs:
                 output.resume()
-        elif action.name == BEGIN_TAKE.name:
-            self._takes += not self._find_open(is_take=True)
-            self._toggle_phase(f"{TAKE}{self._takes}")
-        elif action.name == BEGIN_PHASE.name:
-            self._toggle_phase(self._find_open(is_take=False) or text or "clasp")
+        elif action.name in (BEGIN_TAKE.name, BEGIN_PHASE.name) and self._estimator is not None:
+            begins = action.name not in self._open_phases
+            if begins:
+                self._takes += action.name == BEGIN_TAKE.name
+                phase = f"take_{self._takes}" if action.name == BEGIN_TAKE.name else text or "clasp"
+                self._open_phases[action.name] = phase
+            else:
+                phase = self._open_phases.pop(action.name)
+            # It begins with the next tick: the ticks before have been tracked without it.
+            time_s = self._stream.newest + (1.0 / self._stream.rate_hz if begins else 0.0)
+            self._log_event("begin" if begins else "end", phase=phase, time=time_s)
+            self._estimator.mark_phase(phase, begins=begins)
         else:
             self._log_event("mark", text=text or "mark", time=self._stream.newest)
 
-    def _toggle_phase(self, name: str) -> None:
-        """Begin a phase, or end it. It holds from the next tick on: the ticks before have been tracked without it."""
-        begins = name not in self._open_phases
-        step_s = 1.0 / self._stream.clock.rate_hz if begins else 0.0
-        (self._open_phases.append if begins else self._open_phases.remove)(name)
-        if self._estimator is not None:
-            self._log_event("begin" if begins else "end", phase=name, time=self._stream.newest + step_s)
-            self._estimator.mark_phase(name, begins=begins)
-
     # The state -------------------------------------------------------------------------------------------------------
 
+    def _read_counts(self) -> np.ndarray:
+        """(k, `COUNTS`) of what the ticks were made of."""
+        clock = self._stream.clock
+        return np.zeros((len(self.source.sensors), len(COUNTS)), np.int64) if clock is None else clock.counts.copy()
+
     def build_status(self) -> Status:
-        sensors, estimator, synchronizer = self.source.sensors, self._estimator, self._stream.synchronizer
-        now, k = self.source.clock(), len(sensors)
-        counts, frozen = np.zeros((k, len(COUNTS)), dtype=np.int64), np.zeros(k, dtype=bool)
-        lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S))
-        recorded_s = 0.0
-        if synchronizer is not None:
-            counts, frozen = synchronizer.counts.copy(), synchronizer.frozen.copy()
-            lost |= synchronizer.lost | frozen
-            recorded_s = 0.0 if self.log is None else max(0.0, synchronizer.newest - synchronizer.begin)
-        static, bias, heading_age = np.zeros(k, dtype=bool), np.zeros((k, 3)), 0.0
-        if estimator is not None:
-            static, bias = estimator.static, estimator.gyro_bias
-            heading_age = max(0.0, now - self._heading_reset_time)
-        known = self._monitor.list_statuses(now, self.source.batteries)
-        statuses = [
-            known.get(name, SensorStatus(name))._replace(
+        sensors, estimator, clock = self.source.sensors, self._estimator, self._stream.clock
+        now, counts = self.source.clock(), self._read_counts()
+        known = self._monitor.update(now)
+        frozen = np.zeros(len(sensors), dtype=bool) if clock is None else clock.frozen.copy()
+        lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen
+        lost |= False if clock is None else clock.lost
+        statuses = []
+        for i, name in enumerate(sensors):
+            status = known.get(name, SensorStatus(name))._replace(
                 lost=bool(lost[i]),
-                static=bool(static[i]),
-                gyro_bias=tuple(bias[i].tolist()),
-                heading_std=float(self._heading_std[i]),
-                heading_age=heading_age,
-                late=int(counts[i, LATE]),
-                duplicate=int(counts[i, DUPLICATE]),
                 frozen=bool(frozen[i]),
+                late=int(counts[i, LATE]),
+                heading_std=float(self._heading_std[i]),
             )
-            for i, name in enumerate(sensors)
-        ]
+            if estimator is not None:
+                bias, age_s = tuple(estimator.gyro_bias[i].tolist()), max(0.0, now - self._heading_reset_time)
+                status = status._replace(static=bool(estimator.static[i]), gyro_bias=bias, heading_age=age_s)
+            statuses.append(status)
         problems = dict(self.source.problems)
         for name, count in zip(sensors, counts[:, CUT_OFF].tolist(), strict=True):
             if count:
                 problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = count
-        if self.log is not None and self.log.problem:
-            problems[self.log.problem] = 1
+        recorded_s = 0.0
+        if self.log is not None:
+            recorded_s = 0.0 if clock is None else max(0.0, clock.newest - clock.begin)
+            if self.log.problem:
+                problems[self.log.problem] = 1
         latency = list(itertools.islice(reversed(self._latency), SHOWN_LATENCIES)) or [0.0]
         p50, p99 = (1e3 * np.quantile(latency, (0.5, 0.99))).tolist()
         description = self._describe_state(lost, frozen)
@@ -320,26 +310,92 @@ class LiveLoop(Stage):
             sentences = [sentence for sentence in sentences if sentence] or ["Tracking."]
             return "ready", " ".join(filter(None, sentences + [each.describe() for each in self.outputs])), 1.0
         if self._search is not None:
-            return self._search.describe(self._monitor.describe_wrong_unit(self.source), repeated)
-        missing_sensors = [name for name in self.source.sensors if name not in self._monitor.sending]
-        if not missing_sensors:
+            return self._search.describe(self._monitor.wrong_unit, repeated)
+        missing = [name for name in self.source.sensors if name not in self._monitor.sending]
+        if not missing:
             return "waiting", "Measuring the sampling rate.", 0.0
-        awaited = self.source.describe_awaited(missing_sensors)
+        awaited = self.source.describe_awaited(missing)
         where = f" Waiting for {awaited}." if awaited else ""
-        return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
+        return "waiting", f"Nothing has come yet from {join_names(missing)}.{where}", 0.0
 
-    def _summarize(self) -> SessionSummary:
-        sensors, synchronizer = self.source.sensors, self._stream.synchronizer
-        counts = np.zeros((len(sensors), len(COUNTS)), int) if synchronizer is None else synchronizer.counts
-        return SessionSummary(
-            self._poses,
-            self._last_pose - self._first_pose if self._poses else 0.0,
-            {
-                name: dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.count_missing(name)}
-                for name, row in zip(sensors, counts.tolist(), strict=True)
-            },
-            np.array(self._latency),
-            self._diagnostics,
-            "" if self.log is None else self.log.problem,
-            None if self.log is None else self.log.path,
+
+def run_session(
+    source: Source,
+    setup: SensorSetup,
+    *,
+    method: str = BEST,
+    model: BodyModel | str | Path | None = None,
+    record: str | Path | None = None,
+    force: bool = False,
+    outputs: Sequence[Output] = (),
+    until: Callable[[], bool] = lambda: False,
+) -> SessionSummary:
+    """Open the source, track it to its end, close everything.
+
+    Raises
+    ------
+    WeposeError
+        No such source; a sensor whose mount is not known; an existing file.
+    """
+    setup = setup.as_recorded(model)
+    if record is not None and Path(record).exists() and not force:
+        raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
+    check_mounts(source, setup)
+    warm_up(method)  # before samples come
+    if not open_and_wait(source, outputs, until):
+        for output in outputs:
+            output.close()
+        return SessionSummary()
+    log = None
+    try:
+        check_mounts(source, setup)
+        header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
+        if record is not None:
+            log = LiveLog(Path(record), header, force)
+        begin = float(source.recording.time[0]) if isinstance(source, ReplaySource) else None
+        loop = LiveLoop(source, setup, method=method, model=model, log=log, outputs=outputs, begin=begin)
+    except BaseException:
+        source.close()
+        if log is not None:
+            log.close()
+        raise
+    return loop.run(until)
+
+
+def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) -> bool:
+    """Open the source and show what it waits for; return False where the user ends that by a key.
+
+    Raises `KeyboardInterrupt` where `until` returns True meanwhile, and `WeposeError` where there is no such source.
+    """
+    try:
+        source.open()
+        while not source.connect(CONNECT_S):
+            message = f"Waiting for {source.describe_awaited()}."
+            for output in outputs:
+                output.status(Status("waiting", message, problems=dict(source.problems)))
+            if until():
+                raise KeyboardInterrupt
+            if QUIT in [request for output in outputs for request in output.take_requests()]:
+                source.close()
+                return False
+    except BaseException:
+        source.close()
+        raise
+    return True
+
+
+def warm_up(method: str) -> None:
+    """Track a person who stands: compilation and reading of files must not delay the start pose, nor a correction."""
+    n, rng, upright = 200 + round(200.0 * CAUSAL_KNOT_S), np.random.default_rng(0), np.array([0.0, 0.0, 0.0, 1.0])
+    sensors = {
+        name: ImuSensor(
+            gyro_S=1e-3 * rng.standard_normal((n, 3)),
+            accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
+            stated_quat_LS=upright,
         )
+        for name in tuple(load_table().segments)[:5]
+    }
+    recording = Recording("warm", np.arange(n) / 100.0, 100.0, sensors, {"start": ((0.0, 1.9),)})
+    find_unseen_rate(np.zeros((200, 3)), np.tile([0.0, 0.0, 9.81], (200, 1)), 100.0)
+    source = ReplaySource(recording, math.inf)
+    LiveLoop(source, SensorSetup.from_recording(recording), method=method).loop(lambda: False)

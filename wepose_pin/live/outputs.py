@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadOption
-from .addresses import parse_address
+from .sources.lsl import configure_pylsl
+from .sources.udp import parse_address
 from .state import LivePose, Output, StreamInfo
 
 FORMAT = 1
@@ -19,17 +20,9 @@ DIGITS = 6  # after the point: micrometres, and less than an arc second
 BUFFER_S = 1  # [s] of an LSL stream that liblsl keeps for a slow receiver
 
 
-class RateLimiter:
-    """Accepts `RATE_HZ` poses a second on average, by their own time: a fast replay sends more."""
-
-    def __init__(self) -> None:
-        self._due = -np.inf
-
-    def accepts(self, time: float) -> bool:
-        if self._due - 1.0 < time < self._due - 1e-6:
-            return False
-        self._due = max(self._due + 1.0 / RATE_HZ, time) if abs(time - self._due) < 1.0 else time + 1.0 / RATE_HZ
-        return True
+def find_next_time(due: float, time: float) -> float:
+    """Time [s] of the next pose to send, after that at `time` which was `due`: `RATE_HZ` on average, by their time."""
+    return max(due, time - 1.0 / RATE_HZ) + 1.0 / RATE_HZ - 1e-6
 
 
 class UdpSender:
@@ -63,14 +56,15 @@ class UdpOutput(Output):
     """Sends each pose as JSON in a datagram of its own, `RATE_HZ` a second at most; parameter as of `UdpSender`."""
 
     def __init__(self, to: str) -> None:
-        self._limiter, self._sender = RateLimiter(), UdpSender(to, "--udp", PORT)
+        self._sender, self._due = UdpSender(to, "--udp", PORT), -np.inf
         self._info: StreamInfo | None = None
 
     def start(self, info: StreamInfo) -> None:
         self._info = info
 
     def show(self, pose: LivePose) -> None:
-        if self._info is not None and self._limiter.accepts(pose.time):
+        if self._info is not None and pose.time >= self._due:
+            self._due = find_next_time(self._due, pose.time)
             self._sender.send(pose_json(self._info, pose))
 
     def close(self) -> None:
@@ -107,11 +101,9 @@ class LslOutput(Output):
     """
 
     def __init__(self, name: str = "WeposePose") -> None:
-        from .sources.lsl import configure_pylsl
-
         if not name:
             raise BadOption("LSL out: a stream needs a name, as WeposePose")
-        self._name, self._limiter, self._lsl = name, RateLimiter(), configure_pylsl()
+        self._name, self._due, self._lsl = name, -np.inf, configure_pylsl()
         self._outlet: Any = None
 
     def start(self, info: StreamInfo) -> None:
@@ -128,8 +120,9 @@ class LslOutput(Output):
         self._outlet = self._lsl.StreamOutlet(stream, max_buffered=BUFFER_S)
 
     def show(self, pose: LivePose) -> None:
-        if self._outlet is None or not self._limiter.accepts(pose.time):
+        if self._outlet is None or pose.time < self._due:
             return
+        self._due = find_next_time(self._due, pose.time)
         rows = np.column_stack([pose.quat_WL, pose.std, pose.lost]).ravel()
         stamp = self._lsl.local_clock() - (pose.latency if np.isfinite(pose.latency) else 0.0)
         self._outlet.push_sample([*rows.tolist(), *pose.points.ravel().tolist()], stamp)

@@ -10,11 +10,11 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..body import BodyModel, BodyTable, load_table
+from ..body import BodyTable, load_table
 from ..body.subject import Subject, population_subject
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
@@ -26,9 +26,6 @@ from ..retargeting.targets import check_person_arms
 from .loop import MAX_LATENCIES
 from .outputs import UdpSender
 from .state import LivePose, Output, Status, StreamInfo, round_finite
-
-if TYPE_CHECKING:
-    from .encoder import RobotFigure
 
 FORMAT = 1
 PORT = 9002
@@ -44,25 +41,9 @@ class RobotSummary(NamedTuple):
 
     robot: str
     commands: int
-    skipped: int  # commands that were due while one took too long
-    dropped: int  # that the system did not send
-    stopping: int  # steps in which the robot braked, to stay clear of itself
-    stuck: Mapping[str, float]  # side → [m] by which its hand stayed off, as `CommandStream.stuck`
     share: Mapping[str, float]  # state → share of the commands that had a pose
-    step: np.ndarray  # (n,) [s] of computing the newest commands
     error: Mapping[str, np.ndarray]  # side → (n,) [m] of the hand while it followed, of the newest commands
-
-    @property
-    def diagnostics(self) -> list[Diagnostic]:
-        """Commands that did not reach the robot, steps in which it braked to stay clear of itself, hands that stuck."""
-        unsent, stuck = {"variant": "unsent"}, {"variant": "live"}
-        diagnostics = [
-            Diagnostic("robot-commands-lost", WARNING, self.robot, self.skipped),
-            Diagnostic("robot-stopped-for-clearance", WARNING, self.robot, self.stopping),
-            Diagnostic("robot-commands-lost", WARNING, self.robot, self.dropped, facts=unsent),
-            *(Diagnostic("robot-hand-off-target", WARNING, s, off, STUCK_M, stuck) for s, off in self.stuck.items()),
-        ]
-        return [diagnostic for diagnostic in diagnostics if diagnostic.value]
+    diagnostics: tuple[Diagnostic, ...]  # lost commands, stops to stay clear of itself, hands that stuck
 
 
 class RobotOutput(Output):
@@ -101,8 +82,7 @@ class RobotOutput(Output):
         self._failure: BaseException | None = None
         self.newest: Command | None = None
         self._states: Counter[str] = Counter()
-        self._skipped = 0
-        self._step: deque[float] = deque(maxlen=MAX_LATENCIES)
+        self.skipped = 0  # commands that were due while one took too long
         self._error: dict[str, deque[float]] = {arm.side: deque(maxlen=MAX_LATENCIES) for arm in self.robot.arms}
 
     def open(self) -> None:
@@ -139,24 +119,27 @@ class RobotOutput(Output):
             self._thread.join(PATIENCE_S)
         self._sender.close()
 
-    def figure(self, model: BodyModel) -> RobotFigure:
-        """The robot as the page draws it beside a person."""
-        from .encoder import RobotFigure
-
-        return RobotFigure(self.robot, model, lambda: None if self.newest is None else self.newest.u)
+    def read_position(self) -> np.ndarray | None:
+        """(n,) [rad or m] of the newest command; None before the first."""
+        return None if self.newest is None else self.newest.u
 
     def summary(self) -> RobotSummary:
-        posed = sum(self._states.values())
+        name, posed, stuck = self.robot.map.name, sum(self._states.values()), self.stream.stuck
+        diagnostics = (
+            Diagnostic("robot-commands-lost", WARNING, name, self.skipped),
+            Diagnostic("robot-stopped-for-clearance", WARNING, name, self.stream.stopping),
+            Diagnostic("robot-commands-lost", WARNING, name, self._sender.dropped, facts={"variant": "unsent"}),
+            *(
+                Diagnostic("robot-hand-off-target", WARNING, s, m, STUCK_M, {"variant": "live"})
+                for s, m in stuck.items()
+            ),
+        )
         return RobotSummary(
-            self.robot.map.name,
+            name,
             0 if self.newest is None else self.newest.number + 1,
-            self._skipped,
-            self._sender.dropped,
-            self.stream.stopping,
-            self.stream.stuck,
             {state: count / posed for state, count in self._states.most_common()},
-            np.array(self._step),
             {side: np.array(error) for side, error in self._error.items()},
+            tuple(diagnostic for diagnostic in diagnostics if diagnostic.value),
         )
 
     # In the thread ---------------------------------------------------------------------------------------------------
@@ -167,7 +150,7 @@ class RobotOutput(Output):
             while reported < LAST_COMMANDS:
                 time.sleep(max(0.0, due - time.monotonic()))
                 late = int((time.monotonic() - due) / dt)
-                self._skipped += late if self._taken is not None else 0  # before, the sources warm up
+                self.skipped += late if self._taken is not None else 0  # before, the sources warm up
                 due += (late + 1) * dt
                 if self._closing:
                     self.stream.end("the session has ended")
@@ -195,7 +178,6 @@ class RobotOutput(Output):
         self.newest = command  # before it is sent: who hears of a command finds it described here
         self._sender.send(command_json(self.robot, command, self._speed))
         if not math.isnan(command.time):
-            self._step.append(time.monotonic() - begin)
             self._states[command.state] += 1
         if command.state in ("follow", "slow"):
             for arm, error in zip(self.robot.arms, command.error[:, 0].tolist(), strict=True):
@@ -212,34 +194,28 @@ class RobotOptions:
     stream: StreamOptions = field(default_factory=StreamOptions)
 
 
-ROBOT_KEYS = ("robot", "arm", "to", "rate_hz", "hold_after", "stop_after", "speed_scale", "limit_margin")
+MARGINS, TIMING = ("speed_scale", "limit_margin"), ("rate_hz", "hold_after", "stop_after")
 
 
 def read_robot(name: str) -> RobotOptions:
-    """The robot that ``--robot`` names, and how it follows.
+    """The robot that ``--robot`` names, and how it follows; raises `WeposeError`.
 
-    Parameters
-    ----------
-    name : as of `find_map`, or a TOML file whose key `robot` is such a name and whose other `ROBOT_KEYS` say the rest
-
-    Raises
-    ------
-    WeposeError
-        No such robot, or a key or value that is not possible.
+    `name` is as of `find_map`, or a TOML file whose key `robot` is such a name and whose other keys say the rest.
     """
     file = Path(name)
     values = read_toml(file, "a robot", BadOption) if file.suffix == ".toml" and file.is_file() else {}
     if "robot" not in values:
         return RobotOptions(load_robot(find_map(name)))
     keys = TomlTable(values, name, error=BadOption)
-    keys.allow(*ROBOT_KEYS)
+    keys.allow("robot", "arm", "to", *MARGINS, *TIMING)
     robot = str(keys.text("robot", None))
     beside = file.parent / robot
-    given = {key: float(keys.number(key, None) or 0.0) for key in ROBOT_KEYS[3:] if key in keys}
-    timing = {key: given.pop(key) for key in ("rate_hz", "hold_after", "stop_after") if key in given}
+    margins, timing = (
+        {key: float(keys.number(key, None) or 0.0) for key in names if key in keys} for names in (MARGINS, TIMING)
+    )
     sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
     try:
-        chosen = load_robot(find_map(str(beside) if beside.is_file() else robot), sides, LimitMargins(**given))
+        chosen = load_robot(find_map(str(beside) if beside.is_file() else robot), sides, LimitMargins(**margins))
         return RobotOptions(chosen, str(values.get("to", PORT)), StreamOptions(**timing))
     except WrongOption as error:
         raise BadOption(f"{name}: {error.name.replace('-', '_')} = {error.value}: {error.needed}") from None

@@ -14,7 +14,7 @@ from ..body.body import load_sensed_model
 from ..body.subject import Subject, load_subject, parse_subject, population_subject, subject_toml
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadSession
-from ..readers.session_file import SensorKeys, find_model, read_joints, read_phases, read_sensor_keys, read_session_file
+from ..readers.session_file import SensorKeys, find_model, read_joints, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from .sources.base import Source
 from .sources.replay import ReplaySource
@@ -38,30 +38,24 @@ class SensorSetup:
     def from_recording(
         cls, recording: Recording, subject: Subject | None = None, subject_text: str = ""
     ) -> SensorSetup:
-        return cls(
-            recording.name,
-            subject,
-            subject_text,
-            {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None},
-            recording.phases,
-            recording.start_pose,
-            recording.remounted,
-            recording.joints,
-            recording.model,
-        )
+        mounts = {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None}
+        named = {
+            key: getattr(recording, key) for key in ("name", "phases", "start_pose", "remounted", "joints", "model")
+        }
+        return cls(subject=subject, subject_text=subject_text, mounts=mounts, **named)
 
-    def with_model(self, model: object) -> SensorSetup:
-        """With the file or the name of a body in place of its own; as it is where `model` is neither."""
-        if not isinstance(model, str | Path):
-            return self
-        return replace(self, model=str(Path(model).absolute() if Path(model).is_file() else model))
+    def as_recorded(self, model: object = None) -> SensorSetup:
+        """With the subject as a reader of the recording gets it: rounded to the decimals of its text.
 
-    def as_recorded(self) -> SensorSetup:
-        """With the subject as a reader of the recording gets it: rounded to the decimals of its text."""
+        `model` is the file or the name of a body in place of its own; anything else changes nothing.
+        """
+        setup = self
+        if isinstance(model, str | Path):
+            setup = replace(self, model=str(Path(model).absolute() if Path(model).is_file() else model))
         if self.subject is None or self.subject_text:
-            return self
+            return setup
         text = subject_toml(self.subject)
-        return replace(self, subject=parse_subject(text, Path("subject.toml")), subject_text=text)
+        return replace(setup, subject=parse_subject(text, Path("subject.toml")), subject_text=text)
 
     def header(self, sensors: Sequence[str], orientations: Mapping[str, bool] | None = None) -> dict[str, Any]:
         """Header of the recording of a live session, without the method; `orientations` as of a `Source`."""
@@ -86,24 +80,21 @@ def find_setup(source: Source | None, subject: str | Path | None, session: str |
         loaded, path = load_subject(subject), Path(subject)
         text = (path / "subject.toml" if path.is_dir() else path).read_text(encoding="utf-8")
     if session is not None:
-        return read_setup(Path(session), loaded, text)
+        return replace(read_setup(Path(session)), subject=loaded, subject_text=text)
     if isinstance(source, ReplaySource):
         return SensorSetup.from_recording(source.recording, loaded, text)
     return SensorSetup(subject=loaded, subject_text=text)
 
 
-def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "") -> SensorSetup:
+def read_setup(path: Path) -> SensorSetup:
     """The setup that a session file states; its data and phases belong to another recording and are ignored."""
     top = read_session_file(path)
-    read_phases(top.table("phases", {}))
     sensors = top.table("sensors")
     stated = {segment: read_sensor_keys(sensors.table(segment), SensorKeys()).mount for segment in sensors.values}
     start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
     return SensorSetup(
         top.text("name", None) or Path(top.file).absolute().parent.name,
-        subject,
-        subject_text,
-        {segment: mount for segment, mount in stated.items() if mount is not None},
+        mounts={segment: mount for segment, mount in stated.items() if mount is not None},
         start_pose=start_pose,
         remounted=top.flag("remounted"),
         joints=read_joints(top, start_pose),
@@ -114,10 +105,9 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
 def check_mounts(source: Source, setup: SensorSetup) -> None:
     """Raise `BadSession` where the mount of a sensor is not known, and its orientation is not the segment's own."""
     calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
-    sensors = [name for name in source.sensors if not source.orientations.get(name)]
-    unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
-    nothing_known = not (source.sensors or calibrated or setup.mounts)
-    if unknown or nothing_known:
+    known = {*calibrated, *setup.mounts}
+    unknown = [name for name in source.sensors if name not in known and not source.orientations.get(name)]
+    if unknown or not (source.sensors or known):
         segment = unknown[0] if unknown else "SEGMENT"
         sensor = f"the sensor of {segment} is" if unknown else "the sensors are"
         raise BadSession(

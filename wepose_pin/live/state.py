@@ -1,14 +1,19 @@
-"""What the stages of a live session and their outputs tell each other: poses, the state, what may be asked for."""
+"""`Stage` and `Output` of a live session, and what they tell each other: poses, the state, what may be asked for."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+
+from ..recording.arrivals import Samples
+from .sources.base import Source
 
 LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", "stature": "body height"}
 LONGEST_TEXT = 120  # letters that a person may type
@@ -45,7 +50,6 @@ class SensorStatus(NamedTuple):
     heading_age: float = math.nan  # [s] since the start, or the last reset of the headings
     missing: int = 0  # samples that never came
     late: int = 0  # samples that came after their tick
-    duplicate: int = 0
     frozen: bool = False  # its values repeat bit for bit, though it has noise
     battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
 
@@ -157,6 +161,64 @@ class Output:
 
     def close(self) -> None:
         """End; may be called twice."""
+
+
+class Stage(ABC):
+    """A part of a live session, the guide or tracking: reads an open source until it ends, and shows what comes of it.
+
+    The outputs stay open.
+    """
+
+    READ_TIMEOUT_S = 0.05  # [s]; requests and the status wait for a read
+    STATUS_PERIOD_S = 0.2  # [s]
+
+    def __init__(self, source: Source, outputs: Sequence[Output]) -> None:
+        self.source, self.outputs = source, tuple(outputs)
+        self.is_over = False  # there is nothing more to do
+
+    @property
+    @abstractmethod
+    def actions(self) -> tuple[Action, ...]:
+        """What the person may ask for now."""
+
+    @abstractmethod
+    def do(self, action: Action, text: str) -> None:
+        """Do what the person asks for, with the text that was typed for it."""
+
+    @abstractmethod
+    def process(self, samples: list[Samples]) -> None:
+        """Take the samples of one read, perhaps none."""
+
+    @abstractmethod
+    def build_status(self) -> Status:
+        """The state now; called a few times a second."""
+
+    def ask(self, request: Request) -> None:
+        """Do what the person asks for; what is not offered now is ignored."""
+        action = next((action for action in self.actions if action.name == request.action), None)
+        if action is not None:
+            self.do(action, request.text)
+
+    def loop(self, should_stop: Callable[[], bool]) -> None:
+        """Read, until this is over, the source ends, the person quits or `should_stop` returns True."""
+        due = 0.0
+        while not (self.is_over or should_stop()):
+            samples = self.source.read(self.READ_TIMEOUT_S)
+            if samples is None:
+                return
+            self.process(samples)
+            for request in [request for output in self.outputs for request in output.take_requests()]:
+                if request == QUIT:
+                    return
+                self.ask(request)
+            if time.monotonic() >= due:
+                due = time.monotonic() + self.STATUS_PERIOD_S
+                self.send_status()
+
+    def send_status(self) -> None:
+        status = self.build_status()
+        for output in self.outputs:
+            output.status(status)
 
 
 def round_finite(value: float, digits: int) -> float | None:

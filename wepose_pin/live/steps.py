@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -18,15 +19,12 @@ from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
 from .assignment import ShakeDetector
 from .guide import SILENCE_S, Calibrated, Guide, Step, StepRun, Turn
-from .monitor import check_units
 from .state import LENGTH_NAMES, Action, GuideView, LengthEstimate, join_names
-from .ticks import StillPose
+from .ticks import StillPose, check_units
 
-STATIC_S = 2.0  # [s] of standing still in which the sensors are checked
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
 GET_READY_S = 8.0  # [s] to leave the keyboard and take the pose
-RESUME_S = 3.0  # [s] after an interruption until the phase goes on
-MOST_LOSS_S = 2.0  # [s] of a lost sensor after which its heading has to be found anew
+MOST_LOSS_S = 2.0  # [s] of a silent sensor after which its heading has to be found anew
 SENTENCE_S = 9.0  # [s] for which each sentence of an instruction stands
 FIRST_ESTIMATE_S, ESTIMATE_PERIOD_S = 12.0, 4.0  # [s] of motion before the first estimate, and between two
 FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
@@ -65,7 +63,6 @@ def make_steps(protocol: Protocol) -> list[Step]:
     return [
         Step("sensors", "Sensors", find_sensors, before_attempt=True),
         Step("assignment", "Segments", assign_segments, before_attempt=True),
-        Step("static", "Check", check_sensors),
         Step("start", "Start pose", hold_start_pose),
         *(Step(m.phase, m.phase.replace("_", " ").capitalize(), partial(perform_motion, m)) for m in motions),
         Step("quality", "Result", show_result, records=False),
@@ -78,8 +75,9 @@ def make_steps(protocol: Protocol) -> list[Step]:
 def find_sensors(guide: Guide, _: Turn) -> StepRun:
     needed = len(guide.needs)
     while True:
-        count = len(guide.sending) - len(guide.silent)
-        awaited = guide.source.describe_awaited([name for name in guide.source.sensors if name not in guide.sending])
+        sending = guide.monitor.sending
+        count = len(sending) - len(guide.silent)
+        awaited = guide.source.describe_awaited([name for name in guide.source.sensors if name not in sending])
         sentence = f"Strap the sensors on and switch them on: {count} of {needed} send."
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
@@ -95,7 +93,7 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
     """Find by shaking which sensor sits on which segment; the ends of limbs first: the forearm moves with the arm."""
     if not turn.again:
         known = {name: name for name in guide.order} | dict(guide.options.known) | guide.segments
-        known = {name: known[name] for name in guide.sending if name in known}
+        known = {name: known[name] for name in guide.monitor.sending if name in known}
         if set(guide.needs) <= set(known.values()):
             guide.segments = known
             return Turn()
@@ -108,7 +106,7 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
     guide.segments, shakes = {}, ShakeDetector()
     while True:
         shakes.push(guide.samples, guide.source.orientations)
-        free = [name for name in guide.sending if name not in guide.segments]
+        free = [name for name in guide.monitor.sending if name not in guide.segments]
         segments = [name for name in order if name not in guide.segments.values()]
         shaken = free[0] if len(free) == len(segments) == 1 else shakes.find(free)
         if shaken is not None:
@@ -116,10 +114,10 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
         if not segments:
             return Turn()
         note = ""
-        if moving := shakes.list_moving():
-            note = f"Too gentle, or not alone: {join_names(moving)}. Shake one harder, hold the others still."
+        if moving := join_names(shakes.list_moving()):
+            note = f"Too gentle, or not alone: {moving}. Shake one harder, hold the others still."
             if not shakes.is_calm:
-                note = f"Hold all sensors still for a moment. Moving: {join_names(moving)}."
+                note = f"Hold all sensors still for a moment. Moving: {moving}."
         asked = yield GuideView(
             f"Shake the sensor on the {join_names(segments[:1])}.",
             guide.describe_problems() or note,
@@ -131,114 +129,66 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
             guide.segments, shakes = {}, ShakeDetector()
 
 
-class Stillness:
-    """Waits in the ticks of the guide's attempt until no sensor has moved for some seconds."""
-
-    def __init__(self, guide: Guide, seconds: float) -> None:
-        self._guide, self._attempt, self._seconds = guide, guide.begin_attempt(), seconds
-        self._pose: StillPose | None = None  # from the first tick on
-        self.progress, self.moving = 0.0, ""  # 0 to 1; a sentence on segments that have just moved, empty: none
-
-    def take(self) -> tuple[float, float] | None:
-        """Take the newest ticks; return begin and end [s] of standing still once the seconds are full."""
-        for ticks in self._guide.ticks:
-            self._pose = pose = self._pose or StillPose(self._attempt.stream, self._seconds)
-            row = pose.push_ticks(ticks)
-            if row is not None:
-                end = float(ticks.time[row])
-                return end - self._seconds + 1.0 / self._attempt.stream.clock.rate_hz, end
-            moved = [self._attempt.segments[k] for k in pose.moving] if pose.state == "moved" else []
-            self.progress = pose.held_s / self._seconds
-            self.moving = f"You moved ({join_names(moved)}). Once more: {self._seconds:.0f} s still." if moved else ""
-        return None
-
-
-def check_sensors(guide: Guide, _: Turn) -> StepRun:
-    """Check the units of the sensors while the person stands still, again and again until they are right."""
-    attempt, still, fault = guide.begin_attempt(), Stillness(guide, STATIC_S), ""
-    while True:
-        held = still.take()
-        if held is not None:
-            recording = replace(attempt.recording(), phases={"static": ((held[1] - STATIC_S, held[1]),)})
-            try:
-                scales = [d for d in check_units(recording, guide.source) if d.code == "accel-scale"]
-                fault = " ".join(render(diagnostic).line() for diagnostic in scales)
-            except BadData as error:
-                fault = str(error)
-            if not fault:
-                return Turn()
-            still = Stillness(guide, STATIC_S)
-        note = guide.describe_problems() or fault or still.moving
-        if (yield GuideView("Stand still for a moment.", note, progress=still.progress, actions=(SKIP,))) is SKIP:
-            return Turn(skipped=True)
-
-
 def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
-    """Wait until the person is ready, and until the start pose was held; the motions begin anew."""
-    attempt, reason = guide.begin_attempt(), turn.reason
-    stated = [step for step in guide.options.protocol.steps if step.phase == "start"]
-    seconds = stated[0].seconds if stated else START_POSE_S
-    do = stated[0].do if stated else "Stand still in the start pose."
+    """Wait until the person is ready, then until the start pose was held in right units; the motions begin anew."""
+    attempt, reason, protocol = guide.begin_attempt(), turn.reason, guide.options.protocol
+    seconds, do = START_POSE_S, "Stand still in the start pose."
+    for step in protocol.steps:
+        if step.phase == "start":
+            seconds, do = step.seconds, step.do
     while True:
         asked = None
         while asked is not READY:
-            asked = yield GuideView(do, guide.describe_problems() or reason, actions=(READY,))
-        reason = ""
-        for phase in ("start", *(step.phase for step in guide.options.protocol.steps)):
+            asked = yield GuideView(do, reason or guide.describe_problems(), actions=(READY,))
+        for phase in ("start", *(step.phase for step in protocol.steps)):
             attempt.mark("discard", phase=phase)
-        begin, still = guide.now + GET_READY_S, Stillness(guide, seconds)
-        while asked is not AGAIN:
-            countdown = begin - guide.now
-            if countdown <= 0.0:
-                held = still.take()
-                if held is not None:
+        begin, reason, moved, progress = guide.now + GET_READY_S, "", "", 0.0
+        pose: StillPose | None = None  # from the first tick on
+        while not (asked is AGAIN or reason):
+            for ticks in guide.ticks if guide.now >= begin else ():
+                pose = pose or StillPose(attempt.stream, seconds)
+                row = pose.push_ticks(ticks)
+                progress, moving = pose.held_s / seconds, [attempt.segments[k] for k in pose.moving]
+                moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
+                moved = moved if pose.state == "moved" else ""
+                if row is not None:
+                    held = float(ticks.time[row]) - seconds + 1.0 / attempt.stream.rate_hz, float(ticks.time[row])
+                    try:
+                        check_units(replace(attempt.recording(), phases={"static": (held,)}), guide.source)
+                    except BadData as error:
+                        reason = str(error)
+                        break
                     attempt.mark("begin", phase="start", time=held[0])
                     attempt.mark("end", phase="start", time=held[1])
                     return Turn()
-                countdown = (1.0 - still.progress) * seconds
-            note = guide.describe_problems() or still.moving
-            asked = yield GuideView(do, note, countdown, progress=still.progress, actions=(AGAIN,))
+            countdown = begin - guide.now if guide.now < begin else (1.0 - progress) * seconds
+            note = guide.describe_problems() or moved
+            asked = yield GuideView(do, reason or note, countdown, progress=progress, actions=(AGAIN,))
 
 
 # The motion ----------------------------------------------------------------------------------------------------------
 
 
 def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
-    """Record a phase of the protocol, which pauses while a sensor is silent; the person sees what it has determined."""
-    attempt, phase = guide.begin_attempt(), motion.phase
-    target_s = motion.seconds
+    """Record a phase of the protocol; the person sees what it has determined. A lost sensor needs the start pose."""
+    attempt, phase, target_s = guide.begin_attempt(), motion.phase, motion.seconds
     if turn.again:
         target_s = max(target_s, attempt.measured_s(phase) + min(MORE_S, target_s))
-    begin, running, lost = guide.now + GET_READY_S, False, set[str]()
-    lost_s = lost_since = 0.0
+    begin, running, silent_since = guide.now + GET_READY_S, False, math.inf
     estimates = estimate_gradually(guide, phase)
-
-    def pause() -> None:
-        if running:
-            attempt.mark("end", phase=phase, time=attempt.newest)
-
     try:
         while (done_s := attempt.measured_s(phase)) < target_s:
-            note = ""
-            if guide.silent:
-                pause()
-                lost_since = lost_since if lost else guide.now - SILENCE_S
-                running, lost, lost_s = False, lost.union(guide.silent), guide.now - lost_since
-                begin = max(begin, guide.now + RESUME_S)
-            if lost:
-                every = len(lost) == len(guide.segments)
-                names = "any sensor" if every else join_names([guide.segments[name] for name in sorted(lost)])
-                note = f"No samples from {names}: it goes on when they come again."
-                if lost_s > MOST_LOSS_S and not guide.silent:
-                    reason = f"No samples from {names} for {lost_s:.0f} s, and headings were lost with them"
-                    return Turn("start", reason=f"{reason}: begin once more.")
+            silent = guide.silent
+            silent_since = min(silent_since, guide.now) if silent else math.inf
+            if guide.now - silent_since > MOST_LOSS_S - SILENCE_S:
+                return Turn("start", reason=f"{guide.describe_problems()} Headings were lost: begin once more.")
             if not running and guide.now >= begin:
                 attempt.mark("begin", phase=phase, time=attempt.newest)
-                running, lost, note = True, set(), ""
+                running = True
             finish = [FINISH] * (done_s > min(FINISH_AFTER_S, motion.seconds))
             view = GuideView(
                 _choose_sentence(motion, done_s),
-                note,
+                guide.describe_problems() if silent else "",
                 None if running else max(0.0, begin - guide.now),
                 max(0.0, target_s - done_s),
                 done_s / target_s,
@@ -257,7 +207,8 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
                 return Turn(skipped=True)
         return Turn()
     finally:
-        pause()
+        if running:
+            attempt.mark("end", phase=phase, time=attempt.newest)
 
 
 def _choose_sentence(motion: ProtocolStep, done_s: float) -> str:
@@ -299,10 +250,11 @@ def estimate_gradually(guide: Guide, phase: str) -> Iterator[Calibration | None]
 
 def _add_estimate(view: GuideView, calibration: Calibration, running: bool, motion: ProtocolStep) -> GuideView:
     """The view with what the motion has determined so far, and what to do while the person moves."""
-    newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
+    view = _add_lengths(view, calibration)
     if calibration.exchanged:
         note = view.note or "Some sensors seem to sit on other segments than assigned: finish, and see."
-        return _add_lengths(view._replace(note=note), calibration)
+        return view._replace(note=note)
+    newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
     if running and np.isfinite(newest).any() and np.nanmedian(newest) > APART:
         view = view._replace(note=f"{_choose_sentence(motion, 0.0)} They seem to be apart.")
     elif running and calibration.quality.quality == "pass":
@@ -311,7 +263,7 @@ def _add_estimate(view: GuideView, calibration: Calibration, running: bool, moti
     reasons = [reason for reason in calibration.quality.reasons if not reason.code.startswith("scale-")]
     reasons = [reason for reason in reasons if reason.code.startswith("motion-")] or reasons[:1]
     advice = dict.fromkeys(REMEDIES.get(reason.code, render(reason).do) for reason in reasons)
-    return _add_lengths(view, calibration)._replace(reasons=tuple(advice)[:MOST_ADVICE])
+    return view._replace(reasons=tuple(advice)[:MOST_ADVICE])
 
 
 def _add_lengths(view: GuideView, calibration: Calibration) -> GuideView:
@@ -368,26 +320,23 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple
         return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(str(result),)), ""
     calibration, quality = result.calibration, result.calibration.quality
     codes, lengths_given = [reason.code for reason in quality.reasons], calibration.problem.scale_lengths
-    actions = [ACCEPT, MORE, RESTART]
-    if quality.quality == "pass":
-        sentence = "The calibration is good."
-    elif quality.quality == "poor":
-        sentence = "The calibration can be used, and more motion makes it better."
-        if all(code.startswith("scale-") for code in codes):
-            sentence = "The proportions are good. One measured length gives the scale too."
-            sentence = "The proportions are good. The scale is still uncertain." if lengths_given else sentence
-    elif codes and all(code.startswith(TOO_LITTLE) for code in codes):
-        sentence, actions = "There was too little of the motion. More of it may be enough.", [MORE, RESTART]
-    else:
-        sentence, actions = "This calibration must not be used.", [RESTART, MORE]
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
     begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
     open_s = format_longest([(first - begin, last - begin) for first, last in calibration.open_intervals])
     counted = [replace(d, facts={**d.facts, "intervals": open_s}) if "intervals" in d.facts else d for d in diagnostics]
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
+    actions = [ACCEPT, MORE, RESTART]
     if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned. The same motion will do."
         reasons, actions = reasons[:1], [EXCHANGE, RESTART]
+    elif quality.quality == "pass":
+        sentence = "The calibration is good."
+    elif quality.quality == "poor":
+        sentence = "The calibration can be used. More motion, or one measured length, makes it better."
+    elif codes and all(code.startswith(TOO_LITTLE) for code in codes):
+        sentence, actions = "There was too little of the motion. More of it may be enough.", [MORE, RESTART]
+    else:
+        sentence, actions = "This calibration must not be used.", [RESTART, MORE]
     length = ""
     if any(REMEDIES.get(code) == MEASURE_IT for code in codes):
         best = calibration.problem.measured_example.partition("=")[0]

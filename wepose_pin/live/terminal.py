@@ -78,27 +78,26 @@ class TerminalView(Output):
 
     def _list_changes(self, status: Status, time_s: str) -> list[str]:
         """A line for each state that differs from the last one reported; another number in a sentence is no change."""
-        sentence = describe_state(status)
-        now = {"": re.sub(r"[0-9.]+", "", sentence)}
-        for sensor in status.sensors:
-            now[f"{sensor.segment}: "] = "lost" if sensor.lost else "there"
-        now |= {f"{problem}: ": "since now" for problem, count in status.problems.items() if count}
+        sentence = _describe_state(status)
+        states = {"": (re.sub(r"[0-9.]+", "", sentence), time_s + sentence)}  # what → its state, and the line
+        for each in status.sensors:
+            state = "lost" if each.lost else "there"
+            states[each.segment] = state, f"{time_s}{each.segment}: {state}"
+        states |= {problem: ("now", f"{time_s}{problem}: since now") for problem, n in status.problems.items() if n}
+        if status.guide is not None:
+            states[""] = states[""][0], "\n    ".join([states[""][1], *status.guide.reasons])
         if self._keyboard is not None and status.state != "ended":
-            now["    keys: "] = ", ".join([*(f"{each.key} {each.label}" for each in status.actions), "q end"])
-        changed = [key for key, state in now.items() if self._reported.get(key, "there") != state]
-        self._reported |= now
-        lines = []
-        for key in changed:
-            lines.append(key + now[key] if key.startswith(" ") else time_s + (key + now[key] if key else sentence))
-            if not key and status.guide is not None:
-                lines += [f"    {reason}" for reason in status.guide.reasons]
+            keys = ", ".join([*(f"{each.key} {each.label}" for each in status.actions), "q end"])
+            states["keys"] = keys, f"    keys: {keys}"
+        lines = [line for what, (state, line) in states.items() if self._reported.get(what, "there") != state]
+        self._reported |= {what: state for what, (state, _) in states.items()}
         return lines
 
     def _describe_now(self, status: Status) -> str:
         """The last line: what is typed, else what changes all the time."""
         if self._typing is not None:
             return f"{self._typing.entry} (Return, or Escape): {self._typed}"
-        guide, parts = status.guide, [describe_state(status)]
+        guide, parts = status.guide, [_describe_state(status)]
         if guide is not None:
             parts = [] if guide.countdown is None else [f"begins in {math.ceil(guide.countdown)} s"]
             parts += [] if guide.remaining is None else [f"{guide.remaining:.0f} s left"]
@@ -110,8 +109,7 @@ class TerminalView(Output):
         return "  ".join(parts)
 
 
-def describe_state(status: Status) -> str:
-    """The state in a sentence; of a guide what it says, with what went wrong."""
+def _describe_state(status: Status) -> str:
     if status.guide is not None:
         return f"{status.message} {status.guide.note}".strip()
     return f"{status.state.replace('_', ' ')}: {status.message}"

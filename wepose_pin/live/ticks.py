@@ -1,78 +1,171 @@
-"""Arrivals of a source → ticks of one clock, from when the sensors and the rate are known; the start pose in them."""
+"""Samples as they come: rate, losses and unit of each sensor; ticks of one clock; the start pose in the ticks."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+import math
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
 from ..body import BodyTable
 from ..body.table import NEUTRAL_POSE
-from ..errors import BadData
+from ..diagnostics import Diagnostic
+from ..errors import BadData, WrongUnit
+from ..recording import Recording
 from ..recording.arrivals import Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
+from ..recording.plausibility import check_signals, find_unseen_rate
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
-from .monitor import measure_step
 from .setup import SensorSetup
-from .state import join_names
+from .sources.base import Source
+from .state import SensorStatus, join_names
 
-RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
+UNIT_WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
+FIRST_SAMPLES = 50  # by which a sensor's step is measured
+JUMP_S = 60.0  # [s] between two samples from which on the clock was set and nothing is known
+RATE_MEASUREMENT_S = 1.0  # [s] over which the rate of the ticks is measured if the source does not know it
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
 BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
 
 
+class SampleCounter:
+    """Counts the samples of one sensor, and by the steps between their times those that never came."""
+
+    def __init__(self) -> None:
+        self.missing, self.newest = 0, -math.inf  # samples; time [s]
+        self.last_second: deque[float] = deque()  # times [s] of the samples, those before dropped by who counts them
+        self._first: list[float] = []  # times [s], until the step is known
+        self._step = math.inf  # [s]
+
+    def push(self, time_s: np.ndarray) -> None:
+        """Take the times (m,) [s] of samples in their order of arrival."""
+        times = time_s[np.isfinite(time_s)].tolist()
+        self.last_second.extend(times)
+        if len(self._first) < FIRST_SAMPLES:
+            self._first += times
+            if len(self._first) >= FIRST_SAMPLES:
+                self._step = measure_step(np.array(self._first)) or math.inf
+                times, self.newest = self._first, self._first[0]
+        for t in times:
+            step = t - self.newest
+            if -JUMP_S < step < 0.0:  # it was overtaken, and taken for a lost one
+                self.missing -= self.missing > 0
+                continue
+            self.missing += max(0, round(step / self._step) - 1) if 0.0 <= step < JUMP_S else 0
+            self.newest = t
+
+
+def measure_step(time_s: np.ndarray) -> float:
+    """Measure the step [s] between times (n,) of which some are missing; 0: none can be measured."""
+    steps = np.diff(np.unique(time_s))
+    if len(steps) < 2:
+        return 0.0
+    median, mean = float(np.median(steps)), float(steps.mean())
+    count = np.rint(steps / median)
+    is_even = mean < 3.0 * median and np.sqrt(np.mean((steps / median - count) ** 2)) < 0.2
+    return float(steps.sum() / count.sum()) if is_even else mean  # else time stamps come in bursts, or jitter
+
+
+class SensorMonitor:
+    """Rate, losses and unit of each sensor that has sent something."""
+
+    def __init__(self, source: Source) -> None:
+        self.wrong_unit = ""  # a sentence on sensors whose rates contradict gravity; empty: there is none
+        self._source = source
+        self.sending: dict[str, SampleCounter] = {}  # of the sensors that have sent something
+        self._recent: dict[str, deque[Samples]] = {}
+
+    def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
+        """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
+        for chunk in samples:
+            self.sending.setdefault(chunk.sensor, SampleCounter()).push(chunk.time)
+            if chunk.sensor not in unchecked:
+                recent = self._recent.setdefault(chunk.sensor, deque())
+                recent.append(chunk)
+                while recent[0].time[-1] < recent[-1].time[-1] - UNIT_WINDOW_S:
+                    recent.popleft()
+
+    def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
+        """The sensors without a sample for longer than `silence_s` [s]."""
+        sending = self.sending
+        return [name for name in sensors if name not in sending or now - sending[name].newest > silence_s]
+
+    def update(self, now: float) -> dict[str, SensorStatus]:
+        """Rate over the last second, missing samples and battery of each sensor; looks for a wrong unit as well."""
+        self.wrong_unit, statuses = self._find_wrong_unit(), {}
+        for name, counter in self.sending.items():
+            while counter.last_second and counter.last_second[0] <= now - 1.0:
+                counter.last_second.popleft()
+            battery = self._source.batteries.get(name, math.nan)
+            statuses[name] = SensorStatus(
+                name, float(len(counter.last_second)), missing=counter.missing, battery=battery
+            )
+        return statuses
+
+    def _find_wrong_unit(self) -> str:
+        rates = {}
+        for sensor, recent in self._recent.items():
+            time_s, gyro_S, accel_S = (np.concatenate(column) for column in tuple(zip(*recent, strict=True))[1:])
+            span_s = time_s[-1] - time_s[0]
+            if span_s > 0.9 * UNIT_WINDOW_S:
+                rate = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / span_s)
+                if math.isfinite(rate):
+                    rates[sensor] = rate
+        if not rates:
+            return ""
+        what = f"rates of {max(rates.values()):.2g} rad/s while gravity does not turn: deg/s?"
+        return f"{join_names(list(rates))}: {what} {self._source.explain_unit('gyro_unit', 'deg/s')}."
+
+
+def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
+    """Check the sensors' values as those of a file; raises `BadData`, which says how the source states another unit."""
+    try:
+        return check_signals(recording)
+    except WrongUnit as error:
+        raise BadData(f"{error.finding}: {error.unit}? {source.explain_unit(error.key, error.unit)}.") from None
+
+
 class TickStream:
     """Makes ticks once every sensor has sent a sample and the rate is known, and records the arrivals.
 
-    Parameters
-    ----------
-    rate_hz : of the ticks; None: that of the slowest sensor is measured
-    begin : time [s] of the first tick; None: when every sensor has sent a sample
-    log : the recording; None: nothing is recorded
-    orientations : sensors whose samples are measured orientations
+    `begin` is the time [s] of the first tick; None: when every sensor has sent a sample. `clock` makes the ticks; None
+    before they begin.
     """
 
-    def __init__(
-        self,
-        sensors: Sequence[str],
-        rate_hz: float | None = None,
-        begin: float | None = None,
-        log: LiveLog | None = None,
-        orientations: Collection[str] = (),
-    ) -> None:
-        self.sensors, self.log = tuple(sensors), log
-        self.measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
-        self.synchronizer: StreamSynchronizer | None = None  # makes the ticks, from when they begin
-        self._orientations, self._rate_hz, self._begin = orientations, rate_hz, begin
+    def __init__(self, source: Source, begin: float | None = None, log: LiveLog | None = None) -> None:
+        self.sensors, self.orientations, self.log = tuple(source.sensors), source.orientations, log
+        self.clock: StreamSynchronizer | None = None
+        self._rate_hz, self._begin = source.rate_hz, begin
         self._waiting: list[Arrivals] = []
 
     @property
-    def clock(self) -> StreamSynchronizer:
-        """What makes the ticks; raises `BadData` before they begin."""
-        if self.synchronizer is None:
+    def rate_hz(self) -> float:
+        """Raises `BadData` before the ticks begin."""
+        if self.clock is None:
             raise BadData("there are no samples of all sensors yet")
-        return self.synchronizer
+        return self.clock.rate_hz
 
     @property
     def newest(self) -> float:
-        return self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
+        """Time [s] of the newest tick."""
+        return 0.0 if self.clock is None else self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record the samples of one read, and iterate over the ticks that they complete."""
-        samples = [chunk for chunk in samples if len(chunk.time)]
         if not samples:
             return
         arrivals = order_arrivals(samples, self.sensors)
         if self.log is not None:
             self.log.samples(arrivals)
         self._waiting.append(arrivals)
-        if self.synchronizer is None:
+        if self.clock is None:
             self._begin_ticks()
-        if self.synchronizer is not None:
+        if self.clock is not None:
             waiting, self._waiting = self._waiting, []
             for each in waiting:
-                for ticks in self.synchronizer.iterate_ticks(each):
+                for ticks in self.clock.iterate_ticks(each):
                     yield ticks
                     if self.log is not None:
                         self.log.flush_if_due()
@@ -87,19 +180,19 @@ class TickStream:
         if rate is None:
             if newest - first < RATE_MEASUREMENT_S:
                 return
-            # That of the slowest sensor.
             rates = [1.0 / step for step in map(measure_step, times) if step]
-            rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
-        self.synchronizer = clock = StreamSynchronizer(self.sensors, rate, begin, orientations=self._orientations)
+            rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ  # that of the slowest sensor
+        self.clock = StreamSynchronizer(self.sensors, rate, begin, orientations=self.orientations)
         if self.log is not None:
-            self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=clock.wait_s)
+            self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self.clock.wait_s)
 
 
 class StillPose(StartPoseDetector):
     """Detects in the ticks of a stream that no sensor has moved for `hold_s` [s]."""
 
     def __init__(self, stream: TickStream, hold_s: float = START_POSE_HOLD_S) -> None:
-        super().__init__(stream.clock.rate_hz, stream.measured, hold_s)
+        measured = np.array([name in stream.orientations for name in stream.sensors], dtype=np.bool_)
+        super().__init__(stream.rate_hz, measured, hold_s)
 
     def push_ticks(self, ticks: Ticks) -> int | None:
         """Add ticks; return the row of the one at which the pose has been held so long; None: not yet."""
@@ -126,12 +219,12 @@ class StartPoseSearch:
     def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
         """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
         self.ticks.append(ticks)
-        clock = self._stream.clock
         if self._stated is not None:
-            (row,) = np.nonzero(ticks.time >= self._stated[1] - 0.5 / clock.rate_hz)
+            rate_hz = self._stream.rate_hz
+            (row,) = np.nonzero(ticks.time >= self._stated[1] - 0.5 / rate_hz)
             if row.size:
-                begin = max(0, round((self._stated[0] - clock.begin) * clock.rate_hz))
-                return begin, ticks.first + int(row[0]), int(row[0]) + 1
+                begin = round((self._stated[0] - self.ticks[0].time[0]) * rate_hz)
+                return max(0, begin), ticks.first + int(row[0]), int(row[0]) + 1
             return None
         last = self._pose.push_ticks(ticks)
         if last is not None:
@@ -141,21 +234,18 @@ class StartPoseSearch:
         return None
 
     def describe(self, wrong_unit: str, frozen: str) -> tuple[str, str, float]:
-        """Return the state, the message to the person, and the progress, 0 to 1.
-
-        `wrong_unit` and `frozen` are sentences on sensors in another unit, and on frozen ones, or empty.
-        """
+        """Return state, message and progress, with sentences on sensors in another unit and on frozen ones, or none."""
         pose, sensors = self._pose, self._stream.sensors
         if self._stated is not None:
             begin, end = self._stated
-            progress = float(np.clip((self._stream.clock.newest - begin) / (end - begin), 0.0, 1.0))
+            progress = float(np.clip((self._stream.newest - begin) / (end - begin), 0.0, 1.0))
             return "start_pose", f"{self._instruction}, until {end:g} s.", progress
         if pose.state == "waiting":
             return "waiting", frozen or f"Waiting for {join_names([sensors[k] for k in pose.missing])}.", 0.0
         progress = min(1.0, pose.held_s / START_POSE_HOLD_S)
+        self._longest_s = max(self._longest_s, pose.held_s)
         if wrong_unit:
             return "moved", wrong_unit, progress
-        self._longest_s = max(self._longest_s, pose.held_s)
         if pose.state != "moved":
             left_s = max(0.0, START_POSE_HOLD_S - pose.held_s)
             return "start_pose", f"{self._instruction}: {left_s:.0f} s more.", progress

@@ -1,10 +1,11 @@
-"""`Source`: it is opened, read in the order of arrival, and closed."""
+"""`Source`: it is opened, read in the order of arrival, and closed; `HostClock` for samples with a sender's times."""
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,10 +17,13 @@ from ...recording.arrivals import Samples
 from ...recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 
 MAX_PROBLEMS = 24  # kinds
-# Seconds since 1970 have ten digits; larger times are in another unit, or damaged.
-MAX_TIME = 1e10  # [s]
+MAX_TIME = 1e10  # [s] seconds since 1970 have ten digits; larger times are in another unit, or damaged
 MAX_VALUES = np.repeat([HIGHEST_RATE, HIGHEST_ACCEL], 3)
 IMPLAUSIBLE = "samples with values that no body sensor gives"
+# Of `HostClock`: minima over BUCKET_S are kept for WINDOW_S; the offset follows with SETTLE_S, MAX_SLEW at most.
+BUCKET_S, WINDOW_S, SETTLE_S, MAX_SLEW = 1.0, 10.0, 2.0, 0.01
+JUMP_S = 0.05  # [s] by which a sample is faster than all before: the sender's clock was set, or the first came late
+BACK_S = 1.0  # [s] by which time goes back: the sender has restarted. Less: a datagram was overtaken
 
 
 @dataclass(frozen=True)
@@ -36,21 +40,7 @@ class SourceOptions:
     def error(self, reason: str) -> BadOption:
         return BadOption(f"source '{self.spec}': {reason}")
 
-    def read_pairs(self, text: str, example: str) -> dict[str, str]:
-        """Segment → device of ``DEVICE=SEGMENT,…``; raises `BadOption`."""
-        devices: dict[str, str] = {}
-        for pair in text.split(","):
-            device, equals, segment = pair.rpartition("=")
-            if not equals or not device:
-                raise self.error(f"'{pair}' is no DEVICE=SEGMENT, as {example}={self.segments[0]}")
-            self.check_segment(segment)
-            if segment in devices or device in devices.values():
-                raise self.error(f"'{pair}': each device and each segment is named once")
-            devices[segment] = device
-        return devices
-
     def check_segment(self, name: str) -> None:
-        """Raise `BadOption` where this is not the name of a segment."""
         if name not in self.segments:
             raise self.error(f"'{name}' is not a segment; {one_of(self.segments, name)}")
 
@@ -60,7 +50,7 @@ class SourceOptions:
         for name in self.sensors or ():
             if name not in present:
                 raise self.error(f"no {kind} {name}; {one_of(present, name)}")
-        return present if self.sensors is None else self.sensors
+        return self.sensors or present
 
 
 class SourceKind(NamedTuple):
@@ -138,3 +128,39 @@ class Source(ABC):
             self.count(IMPLAUSIBLE, len(time) - int(plausible.sum()))
             time, values = time[plausible], values[plausible]
         return [Samples(sensor, time, values[:, :3], values[:, 3:])] if len(time) else []
+
+
+class HostClock:
+    """The offset of one sender's clock from ours, from the samples with the smallest delay.
+
+    A sample's arrival minus its time is the clocks' offset plus the sample's delay, and a delay is never negative: the
+    smallest of the last ten seconds is the best estimate of the offset (the minimum filter of NTP, RFC 5905, section
+    10, over a window that follows drift). The applied offset follows that estimate smoothly, so that regular samples
+    stay regular.
+    """
+
+    def __init__(self) -> None:
+        self._buckets: deque[tuple[float, float]] = deque()  # (begin [s] of arrival, smallest arrival − time [s])
+        self._newest, self._offset = -math.inf, 0.0
+
+    def to_host(self, time: np.ndarray, arrival: float) -> np.ndarray:
+        """Times (m,) [s] on our clock of samples that came together, at `arrival` [s] on it."""
+        newest, buckets = float(time.max()), self._buckets
+        delay = arrival - newest  # with the offset
+        if newest < self._newest - BACK_S or delay < self._offset - JUMP_S or not math.isfinite(self._newest):
+            buckets.clear()
+            self._newest, self._offset = newest, delay
+        if buckets and arrival - buckets[-1][0] < BUCKET_S:
+            buckets[-1] = (buckets[-1][0], min(delay, buckets[-1][1]))
+        else:
+            buckets.append((arrival, delay))
+        while arrival - buckets[0][0] > WINDOW_S:
+            buckets.popleft()
+        passed = newest - self._newest
+        if passed <= 0.0:
+            return time + self._offset
+        change = (min(smallest for _, smallest in buckets) - self._offset) * -math.expm1(-passed / SETTLE_S)
+        offset = self._offset + min(max(change, -MAX_SLEW * passed), MAX_SLEW * passed)
+        host = time + (offset if len(time) == 1 else np.interp(time, [self._newest, newest], [self._offset, offset]))
+        self._newest, self._offset = newest, offset
+        return host

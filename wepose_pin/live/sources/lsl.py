@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,8 +32,6 @@ COLLECT_S = 1.0  # [s] for which streams may answer
 MAX_STREAMS = 99  # more than ever answer, so that the search takes all that time
 ANSWER_S = 3.0
 
-_is_configured = False  # liblsl reads its configuration once in a process
-
 
 class Stream(NamedTuple):
     """An inlet and its sensors."""
@@ -40,50 +39,6 @@ class Stream(NamedTuple):
     inlet: Any
     sensors: Mapping[str, tuple[list[int], np.ndarray]]  # sensor → its six channels, and their factors (6,) to SI
     rate_hz: float
-
-
-def find_channels(
-    stream: str, name: str, labels: Sequence[str], units: Sequence[str], segments: Sequence[str]
-) -> dict[str, tuple[list[int], np.ndarray]]:
-    """Sensor → its six channels, gyro xyz and accel xyz, and their factors (6,) to rad/s and m/s².
-
-    `<name>-<segment>` or `<name>_<segment>` is one sensor with channels `gyr_x` … `acc_z`; the first six where none has
-    a label. `<name>` itself is one for all, with channels `<segment>_gyr_x` … `<segment>_acc_z`.
-
-    Raises
-    ------
-    BadSource
-        An unknown segment, label or unit, or missing channels.
-    """
-    where, prefixes = f"lsl:{name}: stream '{stream}'", {segment: f"{segment}_" for segment in segments}
-    if stream != name:
-        segment = stream[len(name) + 1 :]
-        if segment not in segments:
-            raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(segments, segment)}")
-        prefixes = {segment: ""}
-        labels = labels if any(labels) or len(labels) != len(SIGNALS) else SIGNALS
-    sensors = {}
-    for segment, prefix in prefixes.items():
-        if prefix and not any(label.startswith(prefix) for label in labels):
-            continue
-        channels, factors = [], []
-        for signal in SIGNALS:
-            label = prefix + signal
-            if label not in labels:
-                raise BadSource(f"{where}: no channel labelled '{label}'; {one_of(list(filter(None, labels)), label)}")
-            channels.append(list(labels).index(label))
-            known = GYRO_UNITS if signal.startswith("gyr") else ACCEL_UNITS | SQUARED
-            unit = units[channels[-1]] or next(iter(known))
-            if unit not in known:
-                raise BadSource(f"{where}: channel '{label}': unit '{unit}'; {one_of(known, unit)}")
-            factors.append(known[unit])
-        sensors[segment] = channels, np.array(factors)
-    if not sensors:
-        raise BadSource(
-            f"{where}: no channel label names a segment, as {segments[0]}_gyr_x (or send one stream a sensor, named "
-            f"{name}-{segments[0]})"
-        )
-    return sensors
 
 
 def open_spec(rest: str, options: SourceOptions) -> LslSource:
@@ -115,8 +70,8 @@ class LslSource(Source):
     def connect(self, timeout_s: float) -> bool:
         """Search and subscribe; raises `BadSource` where a stream has other channels than it should."""
         query = " or ".join(f"starts-with(name,'{self._name}{end}')" for end in "-_") + f" or name='{self._name}'"
-        found = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=max(COLLECT_S, timeout_s))
-        for info in sorted(found, key=lambda info: info.created_at()):  # of two with one name the older
+        answers = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=max(COLLECT_S, timeout_s))
+        for info in sorted(answers, key=lambda info: info.created_at()):  # of two with one name the older
             if info.name() not in self._streams:
                 self._streams[info.name()] = self._subscribe(info)
         present = [sensor for stream in self._streams.values() for sensor in stream.sensors]
@@ -132,18 +87,40 @@ class LslSource(Source):
 
     def _subscribe(self, info: Any) -> Stream:
         stream = info.name()
+        where = f"lsl:{self._name}: stream '{stream}'"
         flags = self._lsl.proc_clocksync if os.environ.get("LSLAPICFG") else 0  # one machine has one clock
         inlet = self._lsl.StreamInlet(info, max_buflen=BUFFER_S, processing_flags=int(flags))
         try:
             full = inlet.info(timeout=ANSWER_S)
             inlet.open_stream(timeout=ANSWER_S)
         except RuntimeError as error:
-            raise BadSource(f"lsl:{self._name}: stream '{stream}' does not answer: {error}") from None
+            raise BadSource(f"{where} does not answer: {error}") from None
         unnamed = [None] * full.channel_count()
-        labels, units = (
-            [text or "" for text in texts or unnamed] for texts in (full.get_channel_labels(), full.get_channel_units())
-        )
-        sensors = find_channels(stream, self._name, labels, units, self._segments)
+        labels = [label or "" for label in full.get_channel_labels() or unnamed]
+        units = [unit or "" for unit in full.get_channel_units() or unnamed]
+        prefixes = {segment: f"{segment}_" for segment in self._segments}  # of the labels of each sensor
+        if stream != self._name:  # of one sensor, whose first six channels need no label where there are no others
+            segment = stream[len(self._name) + 1 :]
+            if segment not in self._segments:
+                raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(self._segments, segment)}")
+            prefixes = {segment: ""}
+            labels = labels if any(labels) or len(labels) != len(SIGNALS) else list(SIGNALS)
+        sensors = {}
+        for segment, prefix in prefixes.items():
+            if prefix and not any(label.startswith(prefix) for label in labels):
+                continue
+            factors = []
+            for label in (prefix + signal for signal in SIGNALS):
+                if label not in labels:
+                    raise BadSource(f"{where}: no channel labelled '{label}'; {one_of([*filter(None, labels)], label)}")
+                known = GYRO_UNITS if "gyr_" in label else ACCEL_UNITS | SQUARED
+                unit = units[labels.index(label)] or next(iter(known))
+                if unit not in known:
+                    raise BadSource(f"{where}: channel '{label}': unit '{unit}'; {one_of(known, unit)}")
+                factors.append(known[unit])
+            sensors[segment] = [labels.index(prefix + signal) for signal in SIGNALS], np.array(factors)
+        if not sensors:
+            raise BadSource(f"{where}: no channel label names a segment, as {self._segments[0]}_gyr_x")
         return Stream(inlet, sensors, float(full.nominal_srate()))
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
@@ -180,18 +157,15 @@ class LslSource(Source):
         self._streams.clear()
 
 
+@cache  # liblsl reads its configuration once in a process
 def configure_pylsl() -> Any:
     """The module pylsl, which searches this machine only, or as far as the user's own ``LSLAPICFG`` says."""
-    global _is_configured
     try:
         import pylsl
     except (ImportError, RuntimeError) as error:  # RuntimeError: pylsl is there and finds no liblsl
         raise BadSource(f"lsl: needs pylsl ({error}): {how_to_install('pylsl')}") from None
-    if not _is_configured and not os.environ.get("LSLAPICFG"):
-        if not hasattr(pylsl, "set_config_content"):
-            raise BadSource(f"lsl: pylsl {pylsl.__version__} cannot keep to this machine; pylsl 1.18 or later can")
+    if not os.environ.get("LSLAPICFG"):
         pylsl.set_config_content(THIS_MACHINE)
-    _is_configured = True
     return pylsl
 
 

@@ -22,14 +22,13 @@ import numpy as np
 from ...errors import BadSource, how_to_install
 from ...recording.arrivals import Samples
 from ..state import join_names
-from .base import Source, SourceKind, SourceOptions
-from .clocks import HostClock
+from .base import HostClock, Source, SourceKind, SourceOptions
 
 GO_TO_MEASUREMENT, GO_TO_CONFIG, DATA, ERROR, SET_OUTPUT = 0x10, 0x30, 0x36, 0x42, 0xC0  # messages
 SAMPLE_TIME = 0x1060  # [1e-4 s]
-# Name, rate of turn [rad/s], acceleration [m/s²], in the axes of the sensor. Every MTi has the first outputs, up to 100
-# or 400 Hz; some have the others, up to 2 kHz.
-OUTPUTS = (("", 0x8020, 0x4020), ("HR", 0x8040, 0x4040))
+# Rate of turn [rad/s], acceleration [m/s²], in the axes of the sensor. Every MTi has the first outputs, up to 100 or
+# 400 Hz; some have the others ("HR"), up to 2 kHz.
+OUTPUTS = ((0x8020, 0x4020), (0x8040, 0x4040))
 WITH_EVERY_PACKET = 0xFFFF  # rate of the time
 USUAL_HZ = 100
 ANSWER_S = 0.5  # [s] that a device has for an answer
@@ -72,14 +71,12 @@ def parse_packet(data: bytes) -> tuple[float, tuple[float, ...]] | None:
         end = at + 3 + data[at + 2]
         items[(data[at] << 8 | data[at + 1]) & ~0xC] = data[at + 3 : end]  # two bits tell the axes of the world
         at = end
-    for _, gyro, accel in OUTPUTS:
-        if gyro in items:
-            try:
-                (ticks,) = struct.unpack(">I", items[SAMPLE_TIME])
-                return 1e-4 * ticks, struct.unpack(">6f", items[gyro] + items[accel])
-            except (KeyError, struct.error):
-                return None
-    return None
+    gyro, accel = next((pair for pair in OUTPUTS if pair[0] in items), OUTPUTS[0])
+    try:
+        (ticks,) = struct.unpack(">I", items[SAMPLE_TIME])
+        return 1e-4 * ticks, struct.unpack(">6f", items[gyro] + items[accel])
+    except (KeyError, struct.error):
+        return None
 
 
 def open_spec(rest: str, options: SourceOptions) -> MTiSource:
@@ -87,7 +84,15 @@ def open_spec(rest: str, options: SourceOptions) -> MTiSource:
     pairs, separator, rate = rest.rpartition("@")
     if separator and not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
         raise options.error(f"rate '{rate}'; whole samples a second from 1 to 2000, as @100")
-    devices = options.read_pairs(pairs if separator else rest, "/dev/ttyUSB0")
+    devices: dict[str, str] = {}
+    for pair in (pairs if separator else rest).split(","):
+        device, _, segment = pair.rpartition("=")
+        if not device:
+            raise options.error(f"'{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0={options.segments[0]}")
+        options.check_segment(segment)
+        if segment in devices or device in devices.values():
+            raise options.error(f"'{pair}': each device and each segment is named once")
+        devices[segment] = device
     chosen = {name: devices[name] for name in options.choose(devices, "device for")}
     return MTiSource(chosen, int(rate) if separator else USUAL_HZ, options.baud)
 
@@ -108,7 +113,6 @@ class MTiSource(Source):
         self._serial, self._devices, self._hz, self._baud = serial, dict(devices), rate_hz, baud
         self._inbox: SimpleQueue[Samples | str] = SimpleQueue()  # samples, and problems
         self._waits = dict.fromkeys(devices, "the port is being opened")  # segment → why nothing comes; empty: it does
-        self._refusal = ""  # why a device cannot be used at all
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
 
@@ -120,13 +124,9 @@ class MTiSource(Source):
 
     def connect(self, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
-        while any(self._waits.values()):
-            if self._refusal:
-                raise BadSource(self._refusal)
-            if time.monotonic() > deadline:
-                return False
+        while any(self._waits.values()) and time.monotonic() < deadline:
             time.sleep(WAIT_S)
-        return True
+        return not any(self._waits.values())
 
     def read(self, timeout_s: float) -> list[Samples]:
         samples: list[Samples] = []
@@ -155,7 +155,7 @@ class MTiSource(Source):
     # In the thread of a port -----------------------------------------------------------------------------------------
 
     def _run(self, segment: str, path: str) -> None:
-        while not (self._stop.is_set() or self._refusal):
+        while not self._stop.is_set():
             try:
                 with self._serial.Serial(path, self._baud, write_timeout=1.0, exclusive=True) as port:
                     buffer = bytearray()
@@ -173,20 +173,15 @@ class MTiSource(Source):
         """Ask for one packet with time, rate of turn and acceleration, in float32."""
         self._ask(port, buffer, GO_TO_CONFIG)
         offers = []
-        for name, gyro, accel in OUTPUTS:
+        for gyro, accel in OUTPUTS:
             items = struct.pack(">6H", SAMPLE_TIME, WITH_EVERY_PACKET, accel, self._hz, gyro, self._hz)
             mid, answer = self._ask(port, buffer, SET_OUTPUT, items)
             rates = dict(struct.iter_unpack(">2H", answer[: len(answer) // 4 * 4])) if mid != ERROR else {}
-            if rates.get(gyro) == rates.get(accel) == self._hz:
+            offers.append(min(rates.get(gyro, 0), rates.get(accel, 0)))
+            if offers[-1] == self._hz:
                 self._ask(port, buffer, GO_TO_MEASUREMENT)
                 return
-            own = rates.get(gyro, 0), rates.get(accel, 0)
-            offers.append(f"RateOfTurn{name} at {own[0]} Hz, Acceleration{name} at {own[1]} Hz")
-        self._refusal = (
-            f"mti:{port.name}: does not send rate of turn and acceleration at {self._hz} Hz; it offers "
-            f"{', '.join(offers)}; choose a rate that it has"
-        )
-        raise OSError(self._refusal)
+        raise OSError(f"it has no {self._hz} Hz, but {max(offers)} Hz: choose a rate that it has, as @{max(offers)}")
 
     def _ask(self, port: Any, buffer: bytearray, mid: int, data: bytes = b"") -> Frame:
         for _ in range(TRIES):

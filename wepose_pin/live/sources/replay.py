@@ -15,8 +15,7 @@ from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
 from .base import Source, SourceKind, SourceOptions
 
-# Up to 1 kHz every sample comes when it is due, faster ones come together.
-MIN_SLEEP_S = 0.0005
+MIN_SLEEP_S = 0.0005  # up to 1 kHz every sample comes when it is due, faster ones come together
 
 
 def open_spec(rest: str, options: SourceOptions) -> ReplaySource:
@@ -62,30 +61,27 @@ class ReplaySource(Source):
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples that became due since the last call, one `Samples` a sensor; None after the last."""
-        first = self._next
-        if first >= len(self.recording):
+        first, last = self._next, self._next + self._block
+        if first >= len(self._time):
             return None
         deadline = time.monotonic() + timeout_s
-        while (last := self._count_due()) <= first:
-            wait = (float(self._time[first]) - self.clock()) / self._speed
-            left = deadline - time.monotonic()
-            if left <= 0.0:
+        while (
+            not math.isinf(self._speed) and (last := int(np.searchsorted(self._time, self.clock(), "right"))) <= first
+        ):
+            left_s = deadline - time.monotonic()
+            if left_s <= 0.0:
                 return []
-            time.sleep(min(max(wait, MIN_SLEEP_S), left))
-        self._next = last
+            due_s = (float(self._time[first]) - self.clock()) / self._speed
+            time.sleep(min(max(due_s, MIN_SLEEP_S), left_s))
+        self._next = min(last, len(self._time))
         samples = []
         for name, sensor in self.recording.sensors.items():
-            rows: slice | np.ndarray = slice(first, last)
+            rows: slice | np.ndarray = slice(first, self._next)
             if sensor.gap is not None and sensor.gap[rows].any():
                 rows = first + np.flatnonzero(~sensor.gap[rows])
             gyro_S, accel_S = self._numbers[name]
             samples.append(Samples(name, self._time[rows], gyro_S[rows], accel_S[rows]))
         return [each for each in samples if len(each.time)]
-
-    def _count_due(self) -> int:
-        if math.isinf(self._speed):
-            return min(self._next + self._block, len(self.recording))
-        return int(np.searchsorted(self._time, self.clock(), side="right"))
 
 
 KIND = SourceKind("replay:PATH", open_spec)

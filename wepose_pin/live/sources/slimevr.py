@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ...recording.arrivals import Samples, pack_orientations
-from ..addresses import LOOPBACK, parse_address
 from .base import SourceKind, SourceOptions
-from .datagrams import DatagramSource
+from .udp import LOOPBACK, DatagramSource, parse_address
 
 PORT = 6969
 HEARTBEAT_S = 0.5  # [s] from one to the next
@@ -33,20 +31,10 @@ HANDSHAKE, PING, BATTERY, SENSOR_INFO, ROTATION = 3, 10, 12, 15, 17
 # Packets that hold nothing for us: heartbeat, acceleration, tap, error, signal and others.
 UNUSED = frozenset({0, 2, 4, 11, 13, 14, 18, 19, 20, 21, 22, 26})
 NORMAL = 1  # kind of a rotation; 2 is a correction
+ARMS = "left_forearm right_forearm left_upper_arm right_upper_arm left_hand right_hand".split()
 # Place on the body → segment.
-SEGMENT_OF = {
-    1: "head",
-    3: "torso",
-    4: "torso",
-    5: "pelvis",
-    6: "pelvis",
-    13: "left_forearm",
-    14: "right_forearm",
-    15: "left_upper_arm",
-    16: "right_upper_arm",
-    17: "left_hand",
-    18: "right_hand",
-}
+SEGMENT_OF = {1: "head", 3: "torso", 4: "torso", 5: "pelvis", 6: "pelvis", **dict(enumerate(ARMS, 13))}
+DAMAGED = "damaged SlimeVR packets"
 _FIRMWARE_AT = 12 + 7 * 4  # of a handshake, after seven numbers: length and letters of a name, then the MAC address
 
 
@@ -61,32 +49,27 @@ class Tracker:
 
 
 def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
-    """The source of ``slimevr:[HOST][:PORT][,TRACKER=SEGMENT…]``."""
-    address, _, pairs = rest.partition(",")
-    host, port = address or LOOPBACK, PORT
-    if address.isdigit() or ":" in address:
-        host, port = parse_address(address, f"source '{options.spec}':", PORT)
-    devices = options.read_pairs(pairs, "4c:11:ae:00:00:01/0") if pairs else {}
-    assigned = {tracker.lower(): segment for segment, tracker in devices.items()}
-    segments = None if options.any_name else options.segments
-    return SlimeVrSource(host, port, options.sensors or list(devices), segments, assigned=assigned)
+    """The source of ``slimevr:[HOST][:PORT]``."""
+    host, port = rest or LOOPBACK, PORT
+    if rest.isdigit() or ":" in rest:
+        host, port = parse_address(rest, f"source '{options.spec}':", PORT)
+    return SlimeVrSource(host, port, options.sensors, None if options.any_name else options.segments)
 
 
 class SlimeVrSource(DatagramSource):
-    """Orientations of SlimeVR trackers; other parameters and errors as `DatagramSource`.
+    """Orientations of SlimeVR trackers; parameters and errors as `DatagramSource`.
 
-    Where sensors may have any name, a tracker that states no place is ``MAC/SENSOR``.
-
-    `assigned` is tracker, as ``MAC`` or ``MAC/SENSOR``, → segment; it goes before the place that the tracker states.
+    A sensor's name is the segment of the place that its tracker states. Where sensors may have any name, or where its
+    name is among the `sensors`, it is ``MAC/SENSOR``.
     """
 
     kind, sender = "slimevr", "SlimeVR trackers"
     measures_orientations = True
 
-    def __init__(self, *options: Any, assigned: Mapping[str, str] | None = None) -> None:
+    def __init__(self, *options: Any) -> None:
         super().__init__(*options)
-        self.trackers: dict[Any, Tracker] = {}  # by address
-        self._assigned, self._heartbeat = dict(assigned or {}), -math.inf
+        self._trackers: dict[Any, Tracker] = {}  # by address
+        self._heartbeat = -math.inf  # [s]
         self._last_times: dict[str, float] = {}
 
     @property
@@ -95,35 +78,32 @@ class SlimeVrSource(DatagramSource):
 
     @property
     def batteries(self) -> dict[str, float]:
-        batteries = {
-            self._find_segment(tracker, sensor): tracker.battery
-            for tracker in self.trackers.values()
-            for sensor in tracker.places or {0: ""}
-        }
-        return {name: share for name, share in batteries.items() if name is not None and math.isfinite(share)}
+        charged = [tracker for tracker in self._trackers.values() if math.isfinite(tracker.battery)]
+        named = [(self._find_segment(each, sensor), each.battery) for each in charged for sensor in each.places or (0,)]
+        return {segment: share for segment, share in named if segment is not None}
 
-    def _serve(self, now: float) -> None:
+    def serve(self, now: float) -> None:
         if now - self._heartbeat >= HEARTBEAT_S:
             self._heartbeat = now
-            for address in self.trackers:
-                self._send(HEARTBEAT, address)
+            for address in self._trackers:
+                self.send(HEARTBEAT, address)
 
-    def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
+    def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         by_segment: dict[str, list[np.ndarray]] = {}
         for datagram, sender in datagrams:
             try:
                 decoded = self._decode(datagram, sender)
             except (struct.error, IndexError):
-                self.count("SlimeVR packets of a wrong length")
+                self.count(DAMAGED)
                 continue
             if decoded is None:
                 continue
             segment, quat = decoded
             size = float(np.linalg.norm(quat))
-            if not self._tracks(segment):
+            if not self.tracks(segment):
                 self.count(f"orientations of {segment}, which is not tracked")
             elif not abs(size - 1.0) < UNIT_ERROR:
-                self.count("orientations that are none")
+                self.count(DAMAGED)
             else:
                 by_segment.setdefault(segment, []).append(quat / size)
         samples = []
@@ -134,43 +114,35 @@ class SlimeVrSource(DatagramSource):
             samples.append(Samples(segment, time_s, *pack_orientations(np.array(own))))
         return samples
 
-    def _send(self, data: bytes, to: Any) -> None:
-        if self._socket is not None:
-            with suppress(OSError):
-                self._socket.sendto(data, to)
-
     def _decode(self, datagram: bytes, sender: Any) -> tuple[str, np.ndarray] | None:
         """Segment and orientation (4,) xyzw, not yet of unit length, in a datagram; None: it holds none."""
         kind, number = HEADER.unpack_from(datagram)
-        data = datagram[HEADER.size :]
-        tracker = self.trackers.get(sender)
+        data, tracker = datagram[HEADER.size :], self._trackers.get(sender)
         if kind == HANDSHAKE:
             at = _FIRMWARE_AT + 1 + datagram[_FIRMWARE_AT] if len(datagram) > _FIRMWARE_AT else len(datagram)
             mac = datagram[at : at + 6].hex(":")
-            self.trackers[sender] = Tracker(mac, places=tracker.places if tracker is not None else {})
-            self._send(HANDSHAKE_ANSWER, sender)
+            self._trackers[sender] = Tracker(mac, places=tracker.places if tracker is not None else {})
+            self.send(HANDSHAKE_ANSWER, sender)
             return None
-        if tracker is None:
-            # It found a server before; without answer for three seconds it looks for one again.
-            self.count("packets of trackers that have not introduced themselves")
+        if tracker is None:  # it found another server before; without answer for three seconds it looks for one again
             return None
         if number and number <= tracker.number:
             self.count("SlimeVR packets that came twice or too late")
             return None
         tracker.number = max(number, tracker.number)
         if kind == SENSOR_INFO:
-            self._send(struct.pack(">IBB", SENSOR_INFO, data[0], data[1]), sender)
+            self.send(struct.pack(">IBB", SENSOR_INFO, data[0], data[1]), sender)
             if len(data) >= 7 and data[6] in SEGMENT_OF:
                 tracker.places[data[0]] = SEGMENT_OF[data[6]]
         elif kind == PING:
-            self._send(datagram, sender)
+            self.send(datagram, sender)
         elif kind == BATTERY:
             tracker.battery = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
         elif kind == ROTATION and data[1] == NORMAL:
-            sensor, segment = data[0], self._find_segment(tracker, data[0])
+            segment = self._find_segment(tracker, data[0])
             if segment is not None:
                 return segment, np.array(struct.unpack_from(">4f", data, 2))
-            self.count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
+            self.count(f"orientations of {tracker.mac or 'a tracker'}/{data[0]}, whose place on the body is not known")
         elif kind not in UNUSED and kind != ROTATION:
             self.count(f"SlimeVR packets of type {kind}; orientations are read from type {ROTATION}")
         return None
@@ -179,8 +151,7 @@ class SlimeVrSource(DatagramSource):
         named = f"{tracker.mac}/{sensor}"
         if named in self.sensors:
             return named
-        stated = self._assigned.get(named) or (None if sensor else self._assigned.get(tracker.mac))
-        return stated or tracker.places.get(sensor) or (named if self._segments is None and tracker.mac else None)
+        return tracker.places.get(sensor) or (named if self.segments is None and tracker.mac else None)
 
 
-KIND = SourceKind("slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]", open_spec)
+KIND = SourceKind("slimevr:[HOST][:PORT]", open_spec)

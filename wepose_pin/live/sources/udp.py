@@ -1,24 +1,31 @@
-"""Samples from UDP datagrams: lines of JSON, or packed binary (docs/live-sources.md)."""
+"""Samples from UDP datagrams: lines of JSON, or packed binary (docs/live-sources.md); what sources over UDP share."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import select
+import socket
 import struct
+import time
 import zlib
+from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import one_of
+from ...errors import BadOption, BadSource, one_of
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 from ...recording.arrivals import Samples
-from ..addresses import LOOPBACK, parse_address
-from .base import MAX_TIME, SourceKind, SourceOptions
-from .clocks import HostClock
-from .datagrams import DatagramSource
+from .base import MAX_TIME, HostClock, Source, SourceKind, SourceOptions
 
+LOOPBACK = "127.0.0.1"
+MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
+BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
+COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
+MAX_SENSORS = 64  # of any name
 MAX_CLOCKS = 64  # of senders; one that opens a new socket for each datagram has many
 MAX_NAME = 24  # letters of a sensor's name
 MAGIC, VERSION = b"WPIN", 1
@@ -31,6 +38,132 @@ NUMBERS = tuple(
 )
 UNITS = {"gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}  # key → unit → factor to SI
 SI = {"gyro_unit": "rad/s", "accel_unit": "m/s^2"}
+JSON_LINE = '{"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8], "battery": 0.9}'
+
+
+def parse_address(text: str, option: str, example_port: int) -> tuple[str, int]:
+    """Host and port of ``PORT``, of this machine, or ``HOST:PORT``; raises `BadOption` for anything else."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise BadOption(
+            f"{option} {text}: a port or HOST:PORT is needed, as {example_port} or 192.168.1.20:{example_port}"
+        )
+    return host or LOOPBACK, int(port)
+
+
+def name_host(host: str) -> str:
+    """The address under which others reach `host`; of "any address" that of this machine's network."""
+    if host == "0.0.0.0":
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+            host = str(probe.getsockname()[0])
+    return host
+
+
+class DatagramSource(Source):
+    """A UDP socket that takes datagrams from any sender; `take` makes samples of them.
+
+    Parameters
+    ----------
+    port : 0 for any free one; then see `address`
+    sensors : to take; None: those that send while it connects
+    segments : names that sensors may have; None: any, and `sensors` grows as new ones send
+    """
+
+    kind: str  # of the source, for messages
+    sender: str  # who sends to it
+
+    def __init__(
+        self, host: str, port: int, sensors: Sequence[str] | None = None, segments: Collection[str] | None = None
+    ) -> None:
+        super().__init__(sensors or ())
+        self.address, self.segments = (host, port), segments
+        self._socket: socket.socket | None = None
+        self._searching = not self.sensors and segments is not None
+        self._waiting: list[Samples] = []  # that came while it connected
+
+    @abstractmethod
+    def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
+        """Make samples of datagrams, each with its sender's address, that came by `now` [s]; one `Samples` a sensor."""
+
+    def serve(self, now: float) -> None:
+        """Do what senders want to hear from time to time; `now` [s]."""
+
+    def open(self) -> None:
+        """Bind; raises `BadSource` where the address cannot be bound."""
+        host, port = self.address
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+            self._socket.bind((host, port))
+        except (OSError, UnicodeError) as error:
+            self.close()
+            raise BadSource(
+                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); an "
+                f"address of this machine and a port that nobody uses are needed"
+            ) from None
+        self._socket.setblocking(False)
+        self.address = self._socket.getsockname()[:2]
+        if self._searching:
+            self.sensors = tuple(self.segments or ())
+
+    def connect(self, timeout_s: float) -> bool:
+        """Wait for sensors where none are given: those that send within a second of the first sample are taken."""
+        if not self._searching:
+            return True
+        self._waiting += self._read_new(timeout_s)
+        if not self._waiting:
+            return False
+        deadline = time.monotonic() + COLLECT_S
+        while time.monotonic() < deadline:
+            self._waiting += self._read_new(0.1)
+        present = {samples.sensor for samples in self._waiting}
+        self.sensors = tuple(segment for segment in self.sensors if segment in present)
+        self._searching = False
+        return True
+
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
+        host, port = self.address
+        dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
+        here = " (this machine only)" if host.startswith("127.") else ""
+        where = f"{self.sender} at UDP {name_host(host)}:{port}{here}"
+        return where + (f"; dropped so far: {dropped}" if dropped else "")
+
+    def read(self, timeout_s: float) -> list[Samples]:
+        waiting, self._waiting = self._waiting, []
+        return waiting or self._read_new(timeout_s)
+
+    def _read_new(self, timeout_s: float) -> list[Samples]:
+        samples: list[Samples] = []
+        deadline = time.monotonic() + timeout_s
+        while not samples and self._socket is not None:
+            left = deadline - time.monotonic()
+            self.serve(time.monotonic())
+            if select.select([self._socket], [], [], max(left, 0.0))[0]:
+                datagrams: list[tuple[bytes, Any]] = []
+                with contextlib.suppress(OSError):  # BlockingIOError: there are no more; else an ICMP reply
+                    while len(datagrams) < MAX_DATAGRAMS:
+                        datagrams.append(self._socket.recvfrom(65536))
+                samples = self.take(datagrams, time.monotonic())
+            if left <= 0.0:
+                break
+        return samples
+
+    def send(self, data: bytes, to: Any) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, to)
+
+    def tracks(self, sensor: str) -> bool:
+        """Whether a sensor is tracked; where it may have any name, a new one is from now on."""
+        if self.segments is None and sensor not in self.sensors and len(self.sensors) < MAX_SENSORS:
+            self.sensors += (sensor,)
+        return sensor in self.sensors
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
 
 class Batch(NamedTuple):
@@ -38,7 +171,7 @@ class Batch(NamedTuple):
 
     sensor: str
     time: np.ndarray  # (m,) [s]
-    values: np.ndarray  # (m, 6) gyro [rad/s], accel [m/s²]
+    values: np.ndarray  # (m, 6) gyro, accel
     battery: float = math.nan  # share of its charge, 0 to 1; NaN: not said
 
 
@@ -91,13 +224,12 @@ class UdpSource(DatagramSource):
         at = f"{port}" if host == LOOPBACK else f"{host}:{port}"
         return f'State the unit: --source udp:{at},{key}={unit}, or "{key}": "{unit}" in each line of JSON'
 
-    def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
-        """Each sender's samples together, since its newest one determines its clock best."""
-        by_sender: dict[Any, list[Batch]] = {}
+    def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
+        by_sender: dict[Any, list[Batch]] = {}  # together, since its newest sample determines its clock best
         for datagram, sender in datagrams:
-            batches, problems = decode(datagram, self._segments, self._units)
+            batches, problems = decode(datagram, self.segments, self._units)
             for batch in batches:
-                if self._tracks(batch.sensor):
+                if self.tracks(batch.sensor):
                     by_sender.setdefault(sender, []).append(batch)
                     if math.isfinite(batch.battery):
                         self._batteries[batch.sensor] = batch.battery
@@ -105,7 +237,7 @@ class UdpSource(DatagramSource):
                     problems.append(f"samples of {batch.sensor}, which is not tracked")
             for problem in problems:
                 self.count(problem)
-        parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+        by_sensor: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         for sender, batches in by_sender.items():
             if len(self._clocks) >= MAX_CLOCKS:
                 self._clocks.clear()
@@ -113,18 +245,17 @@ class UdpSource(DatagramSource):
             times = clock.to_host(np.concatenate([batch.time for batch in batches]), now)
             for batch in batches:
                 own, times = times[: len(batch.time)], times[len(batch.time) :]
-                parts.setdefault(batch.sensor, []).append((own, batch.values))
+                by_sensor.setdefault(batch.sensor, []).append((own, batch.values))
         samples: list[Samples] = []
-        for sensor, pieces in parts.items():
-            time, values = (np.concatenate(column) for column in zip(*pieces, strict=True))
-            samples += self.keep_plausible(sensor, time, values)
+        for sensor, parts in by_sensor.items():
+            samples += self.keep_plausible(sensor, *map(np.concatenate, zip(*parts, strict=True)))
         return samples
 
 
 def decode(
     datagram: bytes, segments: Collection[str] | None = NUMBERS, units: Mapping[str, str] = SI
 ) -> tuple[list[Batch], list[str]]:
-    """The batches in a datagram, and a problem for each line that is dropped; raises nothing.
+    """The batches in a datagram, in SI, and a problem for each line that is dropped; raises nothing.
 
     `segments` are names of sensors in lines of JSON; None: any. `units` are of what does not state its own.
     """
@@ -133,33 +264,29 @@ def decode(
     is_binary = datagram[:4] == MAGIC
     for part in [datagram] if is_binary else filter(bytes.strip, datagram.splitlines()):
         try:
-            batch, stated = _decode_packet(part, units) if is_binary else _decode_line(part, segments, units)
+            batch, stated = (_decode_packet(part), units) if is_binary else _decode_line(part, segments, units)
+            if not np.abs(batch.time).max() < MAX_TIME:
+                raise Malformed(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
         except Malformed as error:
             problems.append(str(error))
-            continue
-        if not np.abs(batch.time).max() < MAX_TIME:  # no clock has it
-            problems.append("samples with times that no clock has")
             continue
         factors = np.repeat([known[stated[key]] for key, known in UNITS.items()], 3)
         batches.append(batch._replace(values=batch.values * factors))
     return batches, problems
 
 
-def _decode_packet(datagram: bytes, units: Mapping[str, str]) -> tuple[Batch, Mapping[str, str]]:
-    """The samples of a binary packet, and their units."""
+def _decode_packet(datagram: bytes) -> Batch:
     try:
         _, version, number, count, begin = HEADER.unpack_from(datagram)
         (checksum,) = CRC.unpack(datagram[HEADER.size + count * SAMPLE.itemsize :])
     except struct.error:
         raise Malformed("binary packets of a wrong length") from None
-    if version != VERSION:
-        raise Malformed(f"binary packets of version {version}, not {VERSION}")
     if zlib.crc32(datagram[: -CRC.size]) != checksum:
         raise Malformed("binary packets with a bad checksum")
-    if number >= len(NUMBERS) or count == 0:
-        raise Malformed(f"samples of an unknown sensor: number {number}")
+    if version != VERSION or number >= len(NUMBERS) or not count:
+        raise Malformed(f"binary packets of version {version} with {count} samples of the sensor with number {number}")
     samples = np.frombuffer(datagram, SAMPLE, count, HEADER.size)
-    return Batch(NUMBERS[number], begin + samples["after"].astype(float), samples["values"].astype(float)), units
+    return Batch(NUMBERS[number], begin + samples["after"].astype(float), samples["values"].astype(float))
 
 
 def _decode_line(
@@ -170,29 +297,18 @@ def _decode_line(
         message = json.loads(line)
         sensor, battery = message["sensor"], float(message.get("battery", math.nan))
         stated = {key: str(message.get(key, unit)) for key, unit in units.items()}
-        time, gyro, accel = (_read_numbers(message[key]) for key in ("t", "gyro", "accel"))
+        time, gyro, accel = (np.array(message[key], dtype=float) for key in ("t", "gyro", "accel"))
+        if not (time.size and gyro.shape == accel.shape == (*time.shape, 3)) or battery < 0.0 or battery > 1.0:
+            raise ValueError("not as it should be")
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        raise Malformed('lines that are not as {"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": …}') from None
+        raise Malformed(f"lines that are not as {JSON_LINE}") from None
     is_name = isinstance(sensor, str) and 0 < len(sensor) <= MAX_NAME
     if not is_name or (segments is not None and sensor not in segments):
         raise Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
-    if not time.size or battery < 0.0 or battery > 1.0:
-        raise Malformed("lines without samples, or whose battery is not a share, 0 to 1")
-    if not gyro.shape == accel.shape == (*time.shape, 3):
-        raise Malformed("lines whose gyro or accel is not three numbers for each time")
     for key, known in UNITS.items():
         if stated[key] not in known:
             raise Malformed(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
-    values = np.concatenate([gyro, accel], axis=-1).reshape(-1, 6)
-    return Batch(sensor, time.reshape(-1), values, battery), stated
-
-
-def _read_numbers(value: Any) -> np.ndarray:
-    """A number of JSON, or lists of them, as an array; texts and booleans, which NumPy would convert, are refused."""
-    array = np.array(value, dtype=object)
-    if not all(type(each) in (int, float) for each in array.flat):
-        raise ValueError("not all are numbers")
-    return array.astype(float)
+    return Batch(sensor, time.reshape(-1), np.concatenate([gyro, accel], axis=-1).reshape(-1, 6), battery), stated
 
 
 KIND = SourceKind("udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]", open_spec)
