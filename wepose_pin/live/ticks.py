@@ -41,19 +41,22 @@ class SampleCounter:
 
     def push(self, time_s: np.ndarray) -> None:
         """Take the times (m,) [s] of samples in their order of arrival."""
-        times = time_s[np.isfinite(time_s)].tolist()
-        self.last_second.extend(times)
+        times = time_s.tolist()
         if len(self._first) < FIRST_SAMPLES:
-            self._first += times
+            self._first += [t for t in times if math.isfinite(t)]
             if len(self._first) >= FIRST_SAMPLES:
                 self._step = measure_step(np.array(self._first)) or math.inf
                 times, self.newest = self._first, self._first[0]
+                self.last_second.clear()
         for t in times:
             step = t - self.newest
+            if math.isnan(step):
+                continue
+            self.last_second.append(t)
             if -JUMP_S < step < 0.0:  # it was overtaken, and taken for a lost one
                 self.missing -= self.missing > 0
                 continue
-            self.missing += max(0, round(step / self._step) - 1) if 0.0 <= step < JUMP_S else 0
+            self.missing += max(0, round(step / self._step) - 1) if step < JUMP_S else 0
             self.newest = t
 
 
@@ -75,17 +78,16 @@ class SensorMonitor:
         self.wrong_unit = ""  # a sentence on sensors whose rates contradict gravity; empty: there is none
         self._source = source
         self.sending: dict[str, SampleCounter] = {}  # of the sensors that have sent something
-        self._recent: dict[str, deque[Samples]] = {}
+        self._recent: dict[str, list[Samples]] = {}  # of which rates are compared with gravity
 
     def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
         """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
         for chunk in samples:
             self.sending.setdefault(chunk.sensor, SampleCounter()).push(chunk.time)
-            if chunk.sensor not in unchecked:
-                recent = self._recent.setdefault(chunk.sensor, deque())
-                recent.append(chunk)
-                while recent[0].time[-1] < recent[-1].time[-1] - UNIT_WINDOW_S:
-                    recent.popleft()
+            if chunk.sensor in unchecked:
+                self._recent.pop(chunk.sensor, None)
+            else:
+                self._recent.setdefault(chunk.sensor, []).append(chunk)
 
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
         """The sensors without a sample for longer than `silence_s` [s]."""
@@ -107,10 +109,13 @@ class SensorMonitor:
     def _find_wrong_unit(self) -> str:
         rates = {}
         for sensor, recent in self._recent.items():
-            time_s, gyro_S, accel_S = (np.concatenate(column) for column in tuple(zip(*recent, strict=True))[1:])
-            span_s = time_s[-1] - time_s[0]
+            time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*recent, strict=True))[1:])
+            newest = float(np.max(time_s, where=np.isfinite(time_s), initial=-np.inf))
+            rows = time_s > newest - UNIT_WINDOW_S
+            recent[:] = [Samples(sensor, time_s[rows], gyro_S[rows], accel_S[rows])]
+            span_s = newest - float(np.min(time_s, where=rows, initial=newest))
             if span_s > 0.9 * UNIT_WINDOW_S:
-                rate = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / span_s)
+                rate = find_unseen_rate(gyro_S[rows], accel_S[rows], (np.count_nonzero(rows) - 1) / span_s)
                 if math.isfinite(rate):
                     rates[sensor] = rate
         if not rates:
