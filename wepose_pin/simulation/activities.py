@@ -88,8 +88,7 @@ class WholeBodyActivity(Activity):
             along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
             shoulder_T = girdle.place(SIDES[side], self.moving_time(t)) + girdle.displace(along_T, SIDES[side])
             place_arm(pose, side, origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
-        root = self.root(t)
-        if root is not None:
+        if (root := self.root(t)) is not None:
             pose = pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
         return pose
 
@@ -299,31 +298,25 @@ class Sit(WholeBodyActivity):
     _PAUSE_S = (1.0, 3.0)  # standing, seated
 
     def prepare(self, rng: np.random.Generator) -> None:
-        times = int(self.seconds // (2.0 * self._MOVE_S + sum(self._PAUSE_S)))
+        period = 2.0 * self._MOVE_S + sum(self._PAUSE_S)
+        times = int(self.seconds // period)
         if times < 1:
             raise BadOption(f"seconds {self.seconds:g}: sitting down and standing up once takes 8")
         up = self._MOVE_S + self._PAUSE_S[1]  # from the beginning of the way down to that of the way up
-        self.ways: list[tuple[float, float]] = []  # down and up begin [s]
-        start = STAND_S + self._PAUSE_S[0]
-        for _ in range(times):
-            self.ways.append((start, start + up))
-            start += 2.0 * self._MOVE_S + sum(self._PAUSE_S)
+        starts = STAND_S + self._PAUSE_S[0] + period * np.arange(times)
+        self.ways = [(start, start + up) for start in starts.tolist()]  # down and up begin [s]
         self.lean = np.radians(35.0 * rng.uniform(0.85, 1.15))
         self.tilt = 0.6 * self.lean  # of the pelvis, forward
         self.spread = np.radians(rng.uniform(3.0, 10.0, 2))  # of each thigh outwards, seated
 
-    def _seated(self, t: np.ndarray) -> np.ndarray:
-        """Share (n,): 0 standing, 1 seated."""
-        move = self._MOVE_S
-        return sum((make_pulse(t, down, up + move, move) for down, up in self.ways), np.zeros_like(t))
-
-    def _moving(self, t: np.ndarray) -> np.ndarray:
-        """Share (n,): 1 in the middle of each way down or up."""
-        move = self._MOVE_S
-        return sum((make_pulse(t, at, at + move, 0.5 * move) for way in self.ways for at in way), np.zeros_like(t))
+    def _shares(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shares (n,): 0 standing, 1 seated; 1 in the middle of each way down or up."""
+        move, none = self._MOVE_S, np.zeros_like(t)
+        seated = sum((make_pulse(t, down, up + move, move) for down, up in self.ways), none)
+        return seated, sum((make_pulse(t, at, at + move, 0.5 * move) for way in self.ways for at in way), none)
 
     def leg(self, side: str, t: np.ndarray) -> np.ndarray:
-        seated, moving = self._seated(t), self._moving(t)
+        seated, moving = self._shares(t)
         shank_forward, none = np.radians(12.0) * moving, np.zeros_like(t)
         spread = self.spread[list(SIDES).index(side)] * seated
         hip = (np.radians(90.0) * seated + self.tilt * moving, -spread, 0.3 * spread)
@@ -331,14 +324,15 @@ class Sit(WholeBodyActivity):
         return np.moveaxis(np.array((hip, knee, (shank_forward, none, none))), 1, 2)
 
     def trunk(self, t: np.ndarray) -> np.ndarray:
-        forward = self.lean * self._moving(t) + np.radians(3.0) * self._seated(t)
-        turn, none = np.radians(4.0) * self._moving(t), np.zeros_like(t)
-        pelvis = (none, self.tilt * self._moving(t), none)
+        seated, moving = self._shares(t)
+        forward = self.lean * moving + np.radians(3.0) * seated
+        turn, none = np.radians(4.0) * moving, np.zeros_like(t)
+        pelvis = (none, self.tilt * moving, none)
         return np.moveaxis(np.array(((none, forward, turn), pelvis, (none, 0.4 * forward, 2.0 * turn))), 1, 2)
 
     def arm(self, _side: str, t: np.ndarray) -> np.ndarray:
-        reach, rest = np.radians((30.0, 20.0)), np.radians((15.0, 75.0))
-        return self._moving(t)[:, None] * reach + self._seated(t)[:, None] * rest
+        seated, moving = self._shares(t)
+        return moving[:, None] * np.radians((30.0, 20.0)) + seated[:, None] * np.radians((15.0, 75.0))
 
 
 ACTIVITIES: dict[str, type[Activity]] = {each.phase: each for each in (Walk, Sit, ArmTasks, Run, Throw)}

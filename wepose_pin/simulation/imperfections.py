@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -94,11 +94,10 @@ class Imperfections:
 
     def __post_init__(self) -> None:
         check_fields(self, "")
-        for field in fields(self):
-            value = getattr(self, field.name)
-            off = np.inf if "range" in field.name else 0.0
-            if field.name != "mount" and value != off and not 0.0 < value < np.inf:
-                raise BadOption(f"{field.name} {value} must be above 0, or 0 for off (a range: infinity)")
+        for name, value in vars(self).items():
+            off = np.inf if "range" in name else 0.0
+            if name != "mount" and value != off and not 0.0 < value < np.inf:
+                raise BadOption(f"{name} {value} must be above 0, or 0 for off (a range: infinity)")
         if self.bits and not np.isfinite([self.gyro_range_deg_s, self.accel_range_g]).all():
             raise BadOption(f"bits {self.bits} need a finite gyro_range_deg_s and accel_range_g")
         for name, most in (("dropped", 0.2), ("sensor_place", 1.0), ("accel_average", 1.0)):
@@ -106,16 +105,11 @@ class Imperfections:
                 raise BadOption(f"{name} {getattr(self, name)} must be at most {most:g}")
 
 
+_BODY = ("tissue_gain", "tissue_random", "girdle", "elbow", "wrists", "start_pose", "sway")  # of the literature's size
 IDEAL_PRESET = Imperfections()
 MILD_PRESET = Imperfections(
-    tissue_gain=0.3,
-    tissue_random=0.3,
+    **dict.fromkeys(_BODY, 0.3),  # type: ignore[arg-type]
     sensor_place=1.0,
-    girdle=0.3,
-    elbow=0.3,
-    wrists=0.3,
-    start_pose=0.3,
-    sway=0.3,
     palm_slip=0.008,
     gyro_scale=0.001,
     accel_scale=0.005,
@@ -130,13 +124,7 @@ MILD_PRESET = Imperfections(
 )
 PEOPLE_PRESET = replace(
     MILD_PRESET,
-    tissue_gain=1.0,
-    tissue_random=1.0,
-    girdle=1.0,
-    elbow=1.0,
-    wrists=1.0,
-    start_pose=1.0,
-    sway=1.0,
+    **dict.fromkeys(_BODY, 1.0),  # type: ignore[arg-type]
     palm_slip=0.010,
     start_heading_deg=4.0,
     gyro_warm_up_deg_s=0.2,

@@ -13,8 +13,6 @@ from ..errors import BadOption
 from .imperfections import Imperfections
 
 GRAVITY = 9.81  # [m/s^2]
-_GYRO_DENSITY = float(np.deg2rad(0.007))  # [rad/s/sqrt(Hz)]
-_GYRO_BIAS_STD = float(np.deg2rad(0.2))  # [rad/s], turn-on, each axis
 LONGEST_RUN_S = 0.05  # of lost samples
 _MEAN_RUN_S = 0.02
 _WARM_UP_S = 900.0
@@ -33,8 +31,8 @@ class ImuNoise:
     assumption as well.
     """
 
-    gyro_density: NonNegative = _GYRO_DENSITY
-    gyro_bias_std: NonNegative = _GYRO_BIAS_STD
+    gyro_density: NonNegative = float(np.deg2rad(0.007))  # [rad/s/sqrt(Hz)]
+    gyro_bias_std: NonNegative = float(np.deg2rad(0.2))  # [rad/s], turn-on, each axis
     gyro_bias_instability: NonNegative = float(np.deg2rad(10.0)) / 3600.0  # [rad/s]
     accel_density: NonNegative = 120e-6 * GRAVITY  # [m/s^2/sqrt(Hz)]
     accel_bias_std: NonNegative = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
@@ -118,13 +116,7 @@ def _quantise(values: np.ndarray, full_scale: float, bits: int) -> np.ndarray:
 
 
 def jitter_time(rng: np.random.Generator, time: np.ndarray, rate_hz: float, std: float) -> np.ndarray:
-    """Draw the sampling times of a clock with nominal times `time` (n,) [s] and jitter `std` [s], in order.
-
-    Raises
-    ------
-    BadOption
-        The jitter is too large for the rate.
-    """
+    """Draw the sampling times of a clock with nominal times `time` (n,) [s] and jitter `std` [s], in order."""
     if std * rate_hz > 0.25:
         raise BadOption(f"clock_jitter {std} s must be at most a quarter of a step at {rate_hz} Hz")
     return time + np.clip(std * rng.standard_normal(len(time)), -0.45 / rate_hz, 0.45 / rate_hz)

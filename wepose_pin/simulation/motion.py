@@ -71,23 +71,14 @@ class BodyPose(NamedTuple):
 
 
 class BodyMotion(ABC):
-    """A body's motion as a function of continuous time, after standing in the N-pose.
+    """A body's motion as a function of continuous time, after standing in the N-pose."""
 
-    Attributes
-    ----------
-    lengths : of the body [m]
-    p_LS : segment → (3,) [m] in L, of its sensor
-    pulses : begin, end and ramp [s] of each time of motion
-    phases : of the recording: phase → intervals [s]
-    end : of the recording [s]
-    """
-
-    end: float
+    end: float  # [s] of the recording
 
     def __init__(self, lengths: Mapping[str, float], flaws: Flaws) -> None:
         self.lengths, self.flaws = lengths, flaws
-        self.p_LS = place_sensors(lengths, flaws.sizes)
-        self.pulses: list[tuple[float, float, float]] = []
+        self.p_LS = place_sensors(lengths, flaws.sizes)  # segment → (3,) [m] in L
+        self.pulses: list[tuple[float, float, float]] = []  # begin, end and ramp [s] of each time of motion
         self.phases: dict[str, list[tuple[float, float]]] = {"start": [(0.5, STAND_S - 0.5)]}
 
     @abstractmethod
@@ -221,13 +212,7 @@ class Motion(BodyMotion):
         self.bow_axis = size * BOW_AXIS_STD * np.clip(rng.standard_normal(), -2.3, 2.3)
 
     def fit_to_person(self, rng: np.random.Generator) -> None:
-        """Prepare the motion; where shoulders and wrists move, hands stay as near as the arms then need.
-
-        Raises
-        ------
-        BadOption
-            The arms do not reach at all.
-        """
+        """Prepare the motion; where shoulders and wrists move, hands stay as near as the arms then need."""
         self.prepare(rng)
         if not self.flaws.iterates:
             return
@@ -288,17 +273,14 @@ class Motion(BodyMotion):
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
 
-        `swivel` (n,) [rad] turns the elbow about the line from shoulder to palm, from below outwards. The
-        elbow is a hinge: the forearm is the upper arm turned by flexion about -y, then by pronation about its
-        own z.
+        `swivel` (n,) [rad] turns the elbow about the line from shoulder to palm, from below outwards. The elbow is a
+        hinge: the forearm is the upper arm turned by flexion about -y, then by pronation about its own z.
         """
         upper, lower = self.arm[side]
         distance = np.linalg.norm(palm_T, axis=1)
         cos_flexion = (distance**2 - upper**2 - lower**2) / (2.0 * upper * lower)
         if not np.all(np.abs(cos_flexion) < np.cos(self.least_flexion)):
-            raise BadOption(
-                f"lengths: the {side} arm ({upper:.3f} m + {lower:.3f} m) does not reach through the motion"
-            )
+            raise BadOption(f"lengths: the {side} arm ({upper:.3f} + {lower:.3f} m) does not reach through the motion")
         flexion = np.arccos(cos_flexion)
         cos_alpha = (upper + lower * cos_flexion) / distance  # between upper arm and line to the palm
         sin_alpha = lower * np.sin(flexion) / distance
@@ -424,13 +406,7 @@ TASKS: dict[str, type[Motion]] = dict.fromkeys(PARTS, Motion)  # protocol, by it
 
 
 def find_task(protocol: str) -> type[Motion]:
-    """Find the motion of a protocol, or of several that are joined by "+".
-
-    Raises
-    ------
-    BadOption
-        There is none.
-    """
+    """Find the motion of a protocol, or of several that are joined by "+"; `BadOption`: there is none."""
     parts = protocol.split("+")
     if protocol not in TASKS and (not set(parts) <= set(PARTS) or len(set(parts)) < len(parts)):
         raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(TASKS, protocol)}; or several joined by +")
@@ -466,9 +442,8 @@ def make_bow(share: np.ndarray, axis_angle: float) -> Rotation:
 
 def aim_ray(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Return the unit vectors (n, 3) at these angles (n,) [rad] from x: azimuth to the left, elevation up."""
-    return np.column_stack(
-        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
-    )
+    level = np.cos(elevation)
+    return np.column_stack((level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)))
 
 
 def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:

@@ -205,12 +205,9 @@ class Wrists:
 
 
 def compute_girdle(along_T: np.ndarray, side: float) -> np.ndarray:
-    """Compute the displacement (n, 3) of a shoulder's centre in T from rest, of a clavicle of length 1/0.150 m.
+    """Compute the displacement (n, 3) [m] in T of a shoulder's centre from rest, of a clavicle of `_CLAVICLE_LENGTH`.
 
-    Parameters
-    ----------
-    along_T : (n, 3) unit, direction of the upper arm in T
-    side : 1 left, -1 right
+    `along_T` (n, 3) unit is the direction of the upper arm in T; `side` is 1 left, -1 right.
     """
     out, forward, up = side * along_T[:, 1], along_T[:, 0], along_T[:, 2]
     horizontal = np.hypot(out, forward)

@@ -45,14 +45,14 @@ _CREEP_DEG, _CREEP_S = 1.0, 600.0
 _WOBBLE_DEG = 0.5  # per g
 
 
-class ArmRotations(NamedTuple):
-    """What the joints of an arm do at n times."""
+class _ArmRotations(NamedTuple):
+    """What the joints of an arm do at n times [rad]."""
 
-    elevation: np.ndarray  # (n,) [rad] of the upper arm in T
-    swing: np.ndarray  # (n, 3) [rad] rotation vector of the elevation, in the upper arm
-    twist: np.ndarray  # (n,) [rad] of the upper arm against the torso, about its long axis
-    flexion: np.ndarray  # (n,) [rad] of the elbow
-    pronation: np.ndarray  # (n,) [rad] of the forearm against the upper arm, about its long axis
+    elevation: np.ndarray  # (n,) of the upper arm in T
+    swing: np.ndarray  # (n, 3) rotation vector of the elevation, in the upper arm
+    twist: np.ndarray  # (n,) of the upper arm against the torso, about its long axis
+    flexion: np.ndarray  # (n,) of the elbow
+    pronation: np.ndarray  # (n,) of the forearm against the upper arm, about its long axis
 
 
 def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
@@ -63,12 +63,12 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     return about_z.inv().apply(log(compose(R, about_z.inv()).as_quat())), twist
 
 
-def _read_arm(pose: BodyPose, side: str) -> ArmRotations:
+def _read_arm(pose: BodyPose, side: str) -> _ArmRotations:
     R_WU = pose.R_WL[f"{side}_upper_arm"]
     swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
     bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
     elevation, flexion = (np.hypot(np.linalg.norm(v, axis=1), _ROUND) - _ROUND for v in (swing, bend))
-    return ArmRotations(elevation, swing, twist, flexion, pronation)
+    return _ArmRotations(elevation, swing, twist, flexion, pronation)
 
 
 class SoftTissue:

@@ -176,8 +176,6 @@ def simulate(
     seed : int
         The same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of their
         own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
-    rate_hz : float
-        Samples a second.
     noise : ImuNoise
         Of gyroscope and accelerometer; by default that of an Xsens MTi-3, `NOISE_FREE` for none. It and the names in
         capitals below are in `wepose_pin.simulation`.
@@ -186,8 +184,6 @@ def simulate(
         for the sizes that the literature reports.
     clasp_s : float
         [s] duration of the clasp, at least 5.
-    circles : int
-        Number of circles, 0 or more.
     protocol : str
         What the person does in the time of the clasp: "clasp", "t_pose", "bow", or several of them joined by "+".
 
@@ -220,11 +216,10 @@ def simulate(
     missing = [name for name in names if name not in lengths]
     if missing:
         raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
-    if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
-        raise BadOption(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
-    task = find_task(protocol)
+    if clasp_s < 5.0:
+        raise BadOption(f"clasp_s {clasp_s} must be at least 5")
+    task, rngs = find_task(protocol), spawn_streams(seed)
     lengths = {name: float(lengths[name]) for name in names}
-    rngs = spawn_streams(seed)
     flaws = Flaws(imperfections, rngs, lengths)
     motion = task(lengths, rngs["motion"], protocol.split("+"), clasp_s, circles, flaws)
     motion.fit_to_person(rngs["task"])
