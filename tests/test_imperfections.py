@@ -137,17 +137,6 @@ def test_lost_samples_are_bridged_as_in_a_users_file(people: Simulation, tmp_pat
         assert not np.array_equal(sensor.gyro_S, people.gyro_S[segment])
 
 
-def test_mounts_are_at_any_rotation() -> None:
-    sizes = Imperfections(mount="any")
-    mounts = []
-    for seed in range(30):
-        sim = simulate(SUBJECT, seed=seed, imperfections=sizes, **SHORT)
-        assert set(sim.stated_mount.values()) == {None}
-        mounts += list(sim.quat_LS.values())
-    # 150 uniform rotations: each entry of the mean matrix has the standard deviation sqrt(1/3/150)
-    assert np.abs(Rotation.from_quat(mounts).as_matrix().mean(axis=0)).max() < 4 * np.sqrt(1 / 450)
-
-
 # Switches --------------------------------------------------------------------------------------------------------
 
 

@@ -99,17 +99,6 @@ def test_violent_arms_do_not_touch(motion: tuple[float, ...]) -> None:
     is_sound(retargeting.retarget(violent(*motion), retargeting.load_robot(retargeting.find_map("talos"))))
 
 
-def test_what_cannot_stop_in_time_is_slowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A motion in which steps towards the open stop, left out here, would be enough."""
-    monkeypatch.setattr("wepose_pin.retargeting.controller.HALVINGS", 0)
-    rng = np.random.default_rng(6)
-    motion = [rng.uniform(*of) for of in ((1.0, 2.5), (20.0, 80.0), (30.0, 100.0), (20.0, 60.0), (0.0, 6.28))]
-    robot = retargeting.load_robot(retargeting.find_map("talos"))
-    trajectory = retargeting.retarget(violent(*motion), robot)
-    is_sound(trajectory)
-    assert trajectory.run.report.stopping.any()
-
-
 @pytest.mark.parametrize("name", ["panda", "ur5", "baxter", "tiago_dual"])
 def test_no_jerk_where_the_reach_ends(name: str) -> None:
     """Arms that stretch beyond the reach and come back: jerk about these moments against that of the rest."""

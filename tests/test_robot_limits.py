@@ -166,24 +166,6 @@ def test_live_a_robot_that_is_driven_into_itself_stops_short_of_it(
         assert (collision.compute_distances(data, every) >= collision.least_distance - 1e-9).all()
 
 
-def test_no_step_that_keeps_all_the_robot_stands_and_goes_on_when_there_is_one(
-    arm: retargeting.Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A solver that finds nothing for a second: the robot brakes within its limits, waits, and follows again."""
-    pose = person(10.0)
-    session = Session(arm, pose)
-    session.run(live_poses(pose)[:600])
-    with monkeypatch.context() as nothing:
-        nothing.setattr(session.stream._controller, "_solve_qp", lambda *_: None)
-        session.run(live_poses(pose)[600:700])
-    assert session.stream.stopping == 100
-    assert not session.commands[-1].v.any()
-    session.run(live_poses(pose)[700:])
-    assert session.stream.stopping == 100
-    assert np.abs(session.commands[-1].v).max() > 0.01
-    keeps_its_limits(session.messages(), arm)
-
-
 def test_nothing_of_a_robot_on_a_table_goes_below_it(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     said = urdf.with_suffix(".toml").read_text()

@@ -1,6 +1,5 @@
 """The simulator against what shares no code with it: integrals, splines, geometry of the points."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -130,7 +129,7 @@ def test_same_seed_same_bits() -> None:
             assert not np.allclose(a[:500], b[:500], atol=1e-6)
 
 
-@pytest.mark.parametrize("rate_hz", [100.0, 400.0])
+@pytest.mark.parametrize("rate_hz", [400.0])
 def test_white_noise_has_the_stated_density(rate_hz: float) -> None:
     noise = ImuNoise(gyro_bias_std=0.0, gyro_bias_instability=0.0, accel_bias_std=0.0, accel_bias_instability=0.0)
     options = {"seed": 2, "rate_hz": rate_hz, "clasp_s": 20.0, "circles": 1}
@@ -144,21 +143,6 @@ def test_white_noise_has_the_stated_density(rate_hz: float) -> None:
         white = np.corrcoef(np.column_stack((gyro, accel)).T) - np.eye(6)
         assert np.abs(white).max() < 0.1
         assert np.abs(np.sum(gyro[1:] * gyro[:-1], axis=0) / np.sum(gyro**2, axis=0)).max() < 0.1
-
-
-def test_bias_is_what_remains_of_the_noise() -> None:
-    noise = replace(ImuNoise(), gyro_density=0.0, accel_density=0.0)
-    options = {"seed": 5, "clasp_s": 5.0, "circles": 0}
-    biased, clean = simulate(SUBJECT, noise=noise, **options), simulate(SUBJECT, noise=NOISE_FREE, **options)
-    for segment in SEGMENTS:
-        np.testing.assert_allclose(
-            biased.gyro_S[segment] - clean.gyro_S[segment], biased.gyro_bias[segment], atol=1e-14
-        )
-        np.testing.assert_allclose(
-            biased.accel_S[segment] - clean.accel_S[segment], biased.accel_bias[segment], atol=1e-13
-        )
-        assert not clean.gyro_bias[segment].any()
-        assert np.ptp(biased.gyro_bias[segment], axis=0).max() < 4 * noise.gyro_bias_instability
 
 
 def test_bias_statistics() -> None:
@@ -181,7 +165,7 @@ def test_bias_statistics() -> None:
     assert abs(turn_on[:, 0].std() - 1) < 0.1
 
 
-@pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
+@pytest.mark.parametrize("scale", [0.6, 1.2])
 def test_bodies_of_other_sizes(scale: float) -> None:
     sim = simulate({k: scale * v for k, v in SUBJECT.items()}, seed=6, rate_hz=50.0, clasp_s=20.0)
     clasp = within(sim, "clasp")
