@@ -195,20 +195,6 @@ def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> N
     assert set(robot.rest) <= set(robot.arms["right"].joints)
 
 
-def test_the_other_examples_of_the_recipes_import_what_is_there() -> None:
-    names = []
-    for block in blocks("docs/contributing.md", "python"):
-        if not block.startswith((" ", "# wepose_pin/")):  # not lines for the middle of a function
-            for node in ast.walk(ast.parse(block)):
-                if isinstance(node, ast.ImportFrom) and node.module is not None:
-                    names += [(node.module, alias.name) for alias in node.names]
-    assert names
-    for module, name in names:
-        assert hasattr(import_module(module), name), f"{module}.{name}"
-    for block in blocks("docs/contributing.md", "toml"):
-        assert tomllib.loads(block)
-
-
 def test_commands_of_recipes_name_what_is_there() -> None:
     text = "".join(block for page in PAGES for block in blocks(page, ""))
     tests = set(re.findall(r"tests/\w+\.py", text))

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 from reading import text_of
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.commands import main
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
 from wepose_pin.report.track import render_track_report
 from wepose_pin.tracking import TrackResult, summarize, track
@@ -59,12 +59,6 @@ def pose() -> TrackResult:
     return track(recorded(ARM))
 
 
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    return int(stop.value.code or 0)
-
-
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
@@ -90,7 +84,7 @@ def test_an_arm_that_hangs_throughout_is_tracked(
 
 
 @pytest.mark.parametrize("sensors", ["both", "one arm", "forearm"])
-@pytest.mark.parametrize(("seconds", "noise"), [(2.0, 1e-3), (1.2, 1e-3), (6.0, 1e-9)])
+@pytest.mark.parametrize(("seconds", "noise"), [(1.2, 1e-3), (6.0, 1e-9)])
 def test_a_report_of_nothing_that_moves(sensors: str, seconds: float, noise: float) -> None:
     tracked = track(recorded({}, seconds=seconds, noise=noise, sensors=sensors))
     page = render_track_report(summarize(tracked), view="<p>")
@@ -103,7 +97,7 @@ def nowhere(values: np.ndarray, rows: slice) -> np.ndarray:
     return values
 
 
-@pytest.mark.parametrize("rows", [slice(None), slice(0, 300), slice(300, None), slice(1, None), slice(None, None, 2)])
+@pytest.mark.parametrize("rows", [slice(None), slice(0, 300), slice(None, None, 2)])
 @pytest.mark.parametrize("segments", ["arm", "all"])
 def test_a_report_where_segments_are_not_known(pose: TrackResult, rows: slice, segments: str) -> None:
     """No filter should give NaN undeclared; where one does, the report still stands."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from reading import captions, headings, is_self_contained, text_of, without_frame
 
-from wepose_pin.calibration import Calibration, assess, calibrate, load_protocol
+from wepose_pin.calibration import Calibration, calibrate, load_protocol
 from wepose_pin.diagnostics import WARNING, Diagnostic, render
 from wepose_pin.recording import Recording
 from wepose_pin.report.calibration import render_calibration_report
@@ -120,10 +120,3 @@ def test_one_hand_at_a_point(made: Made, tmp_path: Path) -> None:
     assert "Gap of the palms over time" in headings(page)
     assert "Not in the chain, known by the prior's proportions" in text_of(page)
     assert "joined" not in without_frame(page)
-
-
-def test_the_effective_sample_size_has_its_limits(made: Made) -> None:
-    for size, wanted in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
-        checks = assess(replace(made[0], effective_sample_size=size)).checks
-        (check,) = [each for each in checks if each.diagnostic.code == "motion-too-small"]
-        assert (check.value, check.quality) == (size, wanted)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import TABLE
+from commands import run
 from PIL import Image
 from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.body.covariance import compute_axis_std
 from wepose_pin.body.kinematics import Pose
 from wepose_pin.body.subject import Hinge, population_subject
-from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.faults import find_saturation
@@ -346,9 +346,7 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
     made = simulate(simulate_person(3).lengths, seed=3, clasp_s=5.0, circles=0)
     write_session(tmp_path, made.recording("short"))
     for folder, options in (("with", []), ("without", ["--no-report"])):
-        with pytest.raises(SystemExit) as ended:
-            main(["track", str(tmp_path), "-o", str(tmp_path / folder), *options])
-        assert ended.value.code == 0
+        assert run("track", tmp_path, "-o", tmp_path / folder, *options) == 0
         captured = capsys.readouterr()
         assert ("report.html" in captured.out) == (not options)
         assert (tmp_path / folder / "report.html").exists() == (not options)

@@ -113,7 +113,7 @@ def test_toml_of_pages_is_toml() -> None:
 def test_python_of_pages_imports_what_is_there() -> None:
     for page in PAGES:
         for kind, body in blocks(page):
-            if kind != "python" or page == "docs/contributing.md":  # tests/test_docs.py runs the recipes
+            if kind != "python" or body.startswith((" ", "# wepose_pin/")):  # parts of functions; tests/test_docs.py
                 continue
             compile(body, page, "exec")
             for module, names in re.findall(r"^from (wepose_pin[\w.]*) import (.+)$", body, re.MULTILINE):

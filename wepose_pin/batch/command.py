@@ -34,8 +34,7 @@ def batch(
     Parameters
     ----------
     plan
-        The plan, a TOML: the sessions, their subjects, and the steps calibrate, track, retarget, export, evaluate with
-        options.
+        The plan, a TOML: sessions, their subjects, and the steps calibrate, track, retarget, export, evaluate.
     out
         Write items/, one folder per item, and results.parquet to this folder or below this URL.
     scheduler
@@ -43,8 +42,7 @@ def batch(
     workers
         Start this number of workers here. Without it one per processor.
     force
-        Run those items again whose inputs, options or package version have changed. Without it they are kept, with the
-        status "changed".
+        Run those items again whose inputs, options or package have changed. Without it they are kept as "changed".
     """
     from .study import run_batch
 

@@ -44,14 +44,10 @@ def angles(
     further
         Further results, each compared with the first one.
     out
-        Write to this folder: angles.csv (all angles over time), repetitions.csv (lowest, highest, range, peak rate of
-        each angle in each repetition), phases.csv (the same in the whole time and in each phase), summary.csv (mean and
-        standard deviation over repetitions), curves.csv (0 to 100 %), comparison.csv (of several results),
-        sessions.csv, definitions.csv (sequences and signs), the figures as .svg, and angles.html, which shows all of
-        it.
+        Write tables as .csv (all angles over time; lowest, highest, range and peak rate in each repetition and phase;
+        means; curves; definitions), the figures as .svg, and angles.html, which shows all of it, to this folder.
     low_pass_hz
-        Low-pass the orientations at this frequency (Butterworth, second order, forwards and backwards; half the
-        amplitude at HZ). Without it they are not filtered.
+        Low-pass the orientations at this frequency (half the amplitude there). Without it they are not filtered.
     repetitions
         Take each interval of this phase as a repetition. Without it repetitions are found.
     main_angle

@@ -76,36 +76,29 @@ def calibrate(
     out
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     measured
-        Use this measured length; may be given several times. biacromial=0.41 is the breadth over the acromions, the
-        bony edges on top of the shoulders, which a tape reaches: the distance of the shoulder joints is 0.83 ± 0.03 of
-        it. The other names are those of [lengths] in subject.toml, such as left_forearm: from joint centre to joint
-        centre.
+        Use this measured length; may be given several times: biacromial=0.41, the breadth over the bony edges on top of
+        the shoulders, or a name of [lengths] in subject.toml, such as left_forearm, from joint centre to joint centre.
     stature
         Narrow the population prior to people of this body height.
     sex
         Narrow the population prior to women or men.
     protocol
-        Calibrate by this protocol. Without it clasp, and t_pose and bow as well where the session has those phases (not
-        with --formulation paper). Protocols:
-        clasp (hands together), t_pose (arms held sideways), bow (the trunk bends forwards), table (both palms on a
-        table), tip (of a robot's arm or another chain: its point "tip" on a fixed point), free (any motion, no
-        protocol: headings and mounts alone), or a file of your own, made like those in calibration/.
-        Several in one session are joined by +, as in clasp+t_pose.
+        Calibrate by this protocol, or several joined by +, as in clasp+t_pose: clasp (hands together), t_pose (arms
+        sideways), bow (the trunk bends forwards), table (both palms on a table), tip (of a robot's arm: its point "tip"
+        on a fixed point), free (any motion: headings and mounts alone), or a file of your own, made like those in
+        calibration/. Without it clasp, and t_pose and bow where the session has those phases.
     model
-        Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
-        (docs/models.md). Without it the body that the session names, else upper_body.
+        Calibrate this body (docs/models.md). Without it the body that the session names, else upper_body.
     prior
-        Use as the prior this subject.toml, or the one in this folder, of an earlier calibration of the same person:
-        lengths and shoulders with their covariance, so that each session adds to what is known. Its mounts are used
-        too, unless the sensors were taken off: a session with remounted = true uses none of them. Of an Xsens .mvnx
-        only the lengths are used.
+        Use as the prior this subject.toml, or the one in this folder, of an earlier calibration of the same person, so
+        that each session adds to what is known; its mounts too, unless the session has remounted = true. Of an Xsens
+        .mvnx only the lengths are used.
     report
         Write report.html, which shows the quality and what to do about it, lengths, mounts and the gap between the
         palms.
     formulation
         Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
-        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
-        palms, with the mounts as the session states them and a measured length that fixes the scale).
+        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, with stated mounts and a measured length).
     """
     options = dict(locals())
     from .. import calibration as room

@@ -12,10 +12,9 @@ from .simulate import PROTOCOL, check_seed
 def demo(*, out: Out = Path("wepose-demo"), seed: Number = 1, force: Force = False) -> None:
     """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
-    A person of random size wears five Xsens MTi-3, stands in the N-pose (upright, arms hanging, palms to the thighs),
-    moves the joined hands and holds the T-pose, a minute in all, then draws six circles in the air with the right hand
-    and rests it on a table in between. All of it is simulated, so the truth is known. Prints lengths and errors beside
-    the true ones.
+    A person of random size wears five Xsens MTi-3, stands in the N-pose, moves the joined hands and holds the T-pose, a
+    minute in all, then draws six circles in the air with the right hand. All of it is simulated, so the truth is known.
+    Prints lengths and errors beside the true ones.
 
     Example: wepose demo -o demo
 

@@ -29,15 +29,13 @@ def evaluate(
 ) -> Any:  # an Evaluation, whose room loads late
     """Compare a result with a reference: attitude, drift, joint angles, positions, stated uncertainty.
 
-    Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
-    RMSE [deg] and the drift of the heading [deg/min]; for each joint the error of its angles [deg]; for each point the
-    position error [mm], relative to the root and to the place where its limb begins, such as the middle of the
-    shoulders; and whether the stated standard deviations are consistent with the errors. Writes nothing.
+    Prints the errors of each segment's attitude and heading, of each joint's angles with their agreement
+    (Bland-Altman, ICC), and of each point's position, relative to the root and to the place where its limb begins; and
+    whether the stated standard deviations are consistent with them. Writes nothing.
 
     A table with the columns of pose.parquet is compared as it is, without alignment. A file of another system (.c3d,
     .trc, .mvnx) is brought to the clock and the heading of the result first, by the first third of the result, which
-    is then not scored. Prints the clock offset and the heading too, and the agreement of joint angles (Bland-Altman,
-    ICC).
+    is then not scored.
 
     Example: wepose evaluate result truth.parquet --interval 72 115
 

@@ -40,26 +40,22 @@ def export(
         Write this file. Its suffix selects the format.
     format
         Write this format instead of that of the suffix. Of a person: csv, parquet (pose and joint angles), mot (joint
-        angles for OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU
-        Placer), scale (set-up of OpenSim's Scale Tool, .xml), trc (points, as markers), c3d (points and rotations of
-        segments), bvh (skeleton and motion, for animation). Of a person or a robot: rosbag (for ROS 2, in a folder),
-        mcap, rrd (for rerun), urdf. Of robots: lerobot (a data set of episodes, in a folder; joints in rad, not in
-        units of LeRobot's drivers).
+        angles for OpenSim), sto (orientations for OpenSense), placement (of OpenSim's IMU Placer), scale (of OpenSim's
+        Scale Tool, .xml), trc, c3d, bvh. Of a person or a robot: rosbag (for ROS 2, in a folder), mcap, rrd (for
+        rerun), urdf. Of robots: lerobot (a data set of episodes, in a folder; joints in rad).
     rate_hz
         Resample the motion at this rate.
     names
         Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
         coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.
     osim_model
-        Only for .sto and scale. With .sto: write the set-up files of OpenSim's IMU Placer and IMU Inverse Kinematics
-        for this model of the subject beside it. With scale: the generic model that is scaled. Without it
-        Rajagopal_2015.osim. Only the name is used.
+        Only for .sto and scale: name this model in the set-up files that are written, with .sto those of OpenSim's IMU
+        Placer and IMU Inverse Kinematics. Without it scale names Rajagopal_2015.osim.
     episodes
-        Only for lerobot: make each interval of this phase of the recording an episode, or, by the word
-        repetitions, each repetition of the movement. Without it each result is an episode.
+        Only for lerobot: make each interval of this phase of the recording an episode, or, by the word repetitions,
+        each repetition of the movement. Without it each result is an episode.
     instruction
-        Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow", and the name of
-        the recording.
+        Only for lerobot: say what the robot does by this text. Without it "follow", and the name of the recording.
     """
     options = dict(locals())
     from ..writers import export as room

@@ -20,10 +20,9 @@ def info(
 ) -> None:
     """Describe a file, its sensors, rates and gaps, and propose a session file for it.
 
-    Prints the description and the proposal; writes nothing without --write or -o. Reads CSV, Parquet, HDF5 and MATLAB;
-    Xsens MVNX and text files of MT Manager, Movella DOT, x-IMU3, APDM, Shimmer, Delsys, Noraxon, phones (Sensor Logger,
-    phyphox), ROS bags, XDF and OpenSim's orientations, .sto (docs/formats.md); recordings of `wepose live`, sessions,
-    subjects and results. Entries of the proposed session that are guesses are marked CHECK.
+    Prints the description and the proposal; writes nothing without --write or -o. Reads tables, the files of many
+    sensors and programs (docs/formats.md), recordings of `wepose live`, sessions, subjects and results. Entries of the
+    proposed session that are guesses are marked CHECK.
 
     Example: wepose info trial.mvnx --write
 
@@ -36,8 +35,7 @@ def info(
     out
         Write the session to this file.
     model
-        Propose the segments of this body: a URDF, a TOML that names one, or the name of a body of the package, such as
-        whole_body (docs/models.md). Without it those of the upper body.
+        Propose the segments of this body, such as whole_body (docs/models.md). Without it those of the upper body.
     """
     from ..body import load_model
     from ..documents import check_file, whole_file

@@ -50,9 +50,8 @@ def retarget(
 ) -> Retargeted:
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
-    Robots by name: panda and ur5, both also on a table (panda_table, ur5_table), so101, baxter, tiago_dual, talos, g1,
-    alex (from the package example-robot-data). Any other by its URDF with a robot map beside it, a TOML that says which
-    links are shoulder, elbow and hand (docs/robot-maps.md).
+    Robots by name: panda, panda_table, ur5, ur5_table, so101, baxter, tiago_dual, talos, g1, alex. Any other by its
+    URDF with a robot map beside it, a TOML that says which links are shoulder, elbow and hand (docs/robot-maps.md).
 
     Exit code: 0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 one
     of these does not hold: the files are written, but no robot may run them; 2 invalid input, nothing is written.
@@ -64,11 +63,9 @@ def retarget(
     result
         Folder that `wepose track` wrote.
     robot
-        Move this robot: one of the names above, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot
-        map itself.
+        Move this robot: one of the names above, a URDF with a robot map beside it, or the robot map itself.
     out
-        Write trajectory.parquet and .csv, joint_trajectory.json, summary.json, view.html and report.html to
-        this folder.
+        Write trajectory.parquet and .csv, joint_trajectory.json, summary.json, view.html, report.html to this folder.
     arm
         Move only this arm of the robot, or both. Without it all arms that the robot has.
     rate_hz
@@ -87,8 +84,7 @@ def retarget(
     speed_scale
         Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
     limit_margin
-        Keep this distance from the position limits, in radians; from those of a prismatic joint a tenth of it,
-        in metres.
+        Keep this distance from the position limits, in radians; of a prismatic joint a tenth of it, in metres.
     """
     options = dict(locals())
     import json
