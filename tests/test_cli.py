@@ -146,8 +146,8 @@ def test_without_a_gauge_it_says_whose_scale_it_is(
     assert run("calibrate", short, "-o", tmp_path / "subject") == 3
     captured = capsys.readouterr()
     assert "Quality: poor" in captured.out
-    assert "No length was measured." in captured.out
-    assert "No length was measured." not in captured.err  # not twice
+    assert "Measure a length" in captured.out
+    assert "Measure a length" not in captured.err  # not twice
 
 
 def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Path) -> None:
