@@ -15,9 +15,9 @@ from commands import run
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import load_model
-from wepose_pin.body.covariance import compute_axis_std, compute_point_covariances
 from wepose_pin.body.girdle import PARAMETERS
 from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.links import compute_axis_std, compute_point_covariances
 from wepose_pin.body.subject import girdle_rows, population_subject
 from wepose_pin.simulation import MTI_3, simulate, simulate_person
 from wepose_pin.tracking import track

@@ -24,7 +24,6 @@ from wepose_pin.diagnostics import (
     drop_consequences,
     from_json,
     gravest_first,
-    merge,
     quantity,
     render,
     render_all,
@@ -136,15 +135,6 @@ def test_a_code_or_a_fact_that_is_not_there_fails() -> None:
         render(Diagnostic("static-phase-missing", WARNING))
 
 
-def test_a_variant_replaces_parts_of_a_text() -> None:
-    usual, sides = (
-        render(Diagnostic("sensors-exchanged", WARNING, "torso", 3.0, 1.0, facts))
-        for facts in ({}, {"variant": "sides"})
-    )
-    assert usual.title == sides.title
-    assert sides.what == "The left and right sensors seem to be exchanged." != usual.what
-
-
 def test_what_follows_from_a_cause_is_not_shown_beside_it() -> None:
     moved = Diagnostic("start-pose-motion", WARNING, "torso")
     others = [Diagnostic(code, WARNING, "left_elbow") for code in ("mount-contradicted", "hinge-implausible")]
@@ -209,9 +199,3 @@ def test_alike_are_told_together_the_gravest_first() -> None:
     assert texts[0][1].what.endswith("So it is in 2 more: d, e.")
     assert texts[0][1].line(titled=True).startswith("**Samples lost.** The a sensor lost 2 % of its samples")
     assert [each.severity for each in gravest_first([*lost[:1], Diagnostic("x", ERROR)])] == [ERROR, WARNING]
-
-
-def test_what_two_rooms_find_is_told_once() -> None:
-    first, other = (Diagnostic("signal-saturated", WARNING, name, 0.4) for name in ("torso", "head"))
-    again = Diagnostic("signal-saturated", WARNING, "torso", 0.5)
-    assert merge([first], [again, other]) == (first, other)

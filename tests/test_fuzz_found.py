@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -210,21 +209,6 @@ def session(tmp_path: Path) -> Path:
     files = Files(tmp_path / "in", good_table())
     files.folder.mkdir()
     return files.write()
-
-
-def test_paths_that_are_not_utf_8(tmp_path: Path, session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
-    try:
-        session.parent.rename(folder)
-    except OSError:
-        pytest.skip("this file system takes names in UTF-8 only")
-    with pytest.raises(SystemExit) as stop:
-        main(["track", str(folder / "session.toml"), "-o", str(folder / "out")])
-    assert stop.value.code == 0, capsys.readouterr().err
-    assert (folder / "out" / "pose.parquet").stat().st_size > 1000
-    capsys.readouterr()
-    line = refused(["track", str(folder / "none.toml"), "-o", str(folder / "out2")], capsys)
-    assert "caf\\udce9/none.toml: no such file" in line
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no /dev/zero here")

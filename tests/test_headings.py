@@ -11,7 +11,7 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.covariance import compute_axis_std, compute_point_covariances
+from wepose_pin.body.links import compute_axis_std, compute_point_covariances
 from wepose_pin.body.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate

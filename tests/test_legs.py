@@ -21,7 +21,7 @@ from wepose_pin.body.kinematics import Pose, parse_pose_table
 from wepose_pin.commands.evaluate import evaluate as evaluate_result
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
-from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Imperfections, Simulation, simulate_activity
+from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
 from wepose_pin.simulation.people import Flaws
 from wepose_pin.simulation.subject import spawn_streams
@@ -67,37 +67,6 @@ def test_the_upper_body_is_that_of_its_own_urdf() -> None:
     more = {name for kind, name in set(whole) - set(upper) if kind in ("link", "joint")}
     assert all(name.startswith(("left_", "right_")) for name in more)
     assert [key for key in whole if key in upper] == list(upper)
-
-
-@pytest.mark.parametrize(
-    ("segment", "length", "share", "centre", "radii"),
-    [  # de Leva 1996, Table 4, male: length of 1.741 m of stature [mm], then % of mass, length, radii about x, y, z
-        ("thigh", 422.2, 14.16, 40.95, (32.9, 32.9, 14.9)),
-        ("shank", 440.3, 4.33, 43.95, (25.1, 24.6, 10.2)),
-        ("foot", 258.1, 1.37, 44.15, (12.4, 24.5, 25.7)),
-    ],
-)
-def test_a_leg_is_de_levas(
-    segment: str, length: float, share: float, centre: float, radii: tuple[float, float, float]
-) -> None:
-    whole = parts("whole_body.urdf")
-    length *= 1e-3 * 1.75 / 1.741
-    mass = 75.0 * share / 100.0
-    for side in SIDES:
-        inertial = whole["link", f"{side}_{segment}"].find("inertial")
-        assert float(inertial.find("mass").get("value")) == pytest.approx(mass, rel=1e-4)
-        moments = [float(inertial.find("inertia").get(name)) for name in ("ixx", "iyy", "izz")]
-        assert moments == pytest.approx([mass * (r / 100.0 * length) ** 2 for r in radii], rel=4e-3)
-        at = np.array(inertial.find("origin").get("xyz").split(), dtype=float)
-        if segment == "foot":  # from the heel, along the foot
-            heel, toe = (
-                float(whole["joint", f"{side}_{point}_fixed"].find("origin").get("xyz").split()[0])
-                for point in ("heel", "toe")
-            )
-            assert toe - heel == pytest.approx(length, abs=1e-3)
-            assert at[0] - heel == pytest.approx(centre / 100.0 * length, abs=1e-3)
-        else:
-            assert at[2] == pytest.approx(-centre / 100.0 * length, abs=1e-3)
 
 
 # Activities -------------------------------------------------------------------------------------------------------
@@ -177,32 +146,6 @@ def test_running_shakes_the_trunk_and_a_throw_turns_one_upper_arm() -> None:
     peaks = {side: np.linalg.norm(throw.gyro_S[f"{side}_upper_arm"], axis=1).max() for side in SIDES}
     assert 15.0 < max(peaks.values()) < 20.0
     assert min(peaks.values()) < 6.0  # it turns with the trunk
-
-
-def test_an_accelerometer_that_averages_is_half_a_sample_late() -> None:
-    """At 50 Hz it measures the mean of twenty samples at 1 kHz, in the sensor that turns meanwhile."""
-    options = {"seed": 2, "noise": NOISE_FREE, "seconds": 5.0}
-    fine = simulate_activity("walk", rate_hz=1000.0, **options)
-    at_once, averaged = (
-        simulate_activity("walk", rate_hz=50.0, imperfections=Imperfections(accel_average=share), **options)
-        for share in (0.0, 1.0)
-    )
-    for segment, accel_S in averaged.accel_S.items():
-        mean = np.lib.stride_tricks.sliding_window_view(fine.accel_S[segment], 21, axis=0)[::20]
-        mean = (mean.sum(axis=-1) - 0.5 * (mean[..., 0] + mean[..., -1])) / 20.0  # trapezoids
-        n = min(len(mean), len(accel_S) - 1)
-        late = np.abs(accel_S - at_once.accel_S[segment]).max()
-        assert np.abs(accel_S[1 : n + 1] - mean[:n]).max() < 0.04 * late, segment  # of four points against twenty
-        np.testing.assert_array_equal(averaged.gyro_S[segment], at_once.gyro_S[segment])
-    with pytest.raises(BadOption, match=r"accel_average 2\.0 must be at most 1"):
-        Imperfections(accel_average=2.0)
-
-
-def test_standing_at_the_start_is_the_n_pose(made: Simulation) -> None:
-    standing = made.time < 4.9
-    for segment, quat in made.quat_WL.items():
-        np.testing.assert_array_equal(quat[standing], np.tile([0.0, 0.0, 0.0, 1.0], (standing.sum(), 1)), segment)
-    assert set(made.phases) > {"start", "rest"}
 
 
 def test_an_activity_that_is_none_or_too_short_is_named() -> None:

@@ -13,10 +13,8 @@ import yourdfpy
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import BodyModel, convert_breadths, load_model, load_table
-from wepose_pin.diagnostics import from_json, render
+from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
-from wepose_pin.recording import Recording
-from wepose_pin.tracking import summarize, track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
 SEGMENTS = ["torso", "pelvis", "head"] + [
@@ -117,13 +115,6 @@ def xml_mass(text: str) -> float:
 
 
 # Ours -------------------------------------------------------------------------------------------------------------
-
-
-def test_our_model_has_nine_spherical_joints_and_two_shoulders_that_slide() -> None:
-    body = load_model()
-    assert set(body.joints) == set(SEGMENTS) == set(body.axes)
-    assert (body.pin.nq, body.pin.nv) == (9 * 4 + 6, 9 * 3 + 6)
-    assert all(body.pin.joints[k].shortname() == "JointModelSpherical" for k in body.joints.values())
 
 
 def test_our_segment_frames_equal_w_in_the_n_pose() -> None:
@@ -383,50 +374,6 @@ def test_meshes_are_named_and_not_read(tmp_path: Path, caplog: pytest.LogCapture
     assert caplog.records == []
 
 
-def test_continuous_joints_turn_without_end(tmp_path: Path) -> None:
-    elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3", TRIPLE[1:], ("0 0 0",) * 2)
-    elbow = elbow.replace('name="left_forearm_j1" type="revolute"', 'name="left_forearm_j1" type="continuous"')
-    text = small(elbow=elbow)
-    body = load_model(written(tmp_path, text))
-    at = body.pin.idx_qs[body.pin.getJointId("left_forearm_j1")]
-    assert body.pin.lowerPositionLimit[at] < -1e300
-    q = pin.neutral(body.pin)
-    q[at] = 7.0
-    turned = link_placements(body.pin, q)["left_forearm"][:3, :3]
-    np.testing.assert_allclose(turned, Rotation.from_rotvec([0.0, 0.0, 7.0]).as_matrix(), atol=1e-12)
-
-
-def inertial(mass: str = "5", izz: str = "0.1", at: str = "0 0 0") -> str:
-    inertia = f'<inertia ixx="0.1" iyy="0.1" izz="{izz}" ixy="0" ixz="0" iyz="0"/>'
-    return f'<inertial><origin xyz="{at}"/><mass value="{mass}"/>{inertia}</inertial>'
-
-
-TURNED = ("0 0 1.5707963267948966", "0 -1.5707963267948966 0.4")  # axes that are orthogonal all the same
-
-
-def test_light_links_between_the_axes_do_not_keep_a_triple_apart(tmp_path: Path) -> None:
-    """Their mass, its place and its inertia go with the segment."""
-    axes = ("1 0 0",) * 3
-    text = small(elbow=triple("left_upper_arm", "left_forearm", "0 0 -0.3", axes, rpy=("0.3 -0.2 0.5", *TURNED)))
-    for k, at in ((0, "0.1 0.2 0.3"), (1, "-0.3 0.5 0.1")):
-        light = inertial(mass="1e-4", at=at)
-        text = text.replace(f'<link name="left_forearm_{k}"/>', f'<link name="left_forearm_{k}">{light}</link>')
-    body = load_model(written(tmp_path, text))
-    raw = pin.buildModelFromXML(text)
-    assert "left_forearm" in body.joints
-    assert pin.computeTotalMass(body.pin) == pytest.approx(2e-4, rel=1e-12)
-    ours, theirs = (pin.centerOfMass(m, m.createData(), pin.neutral(m)) for m in (body.pin, raw))
-    np.testing.assert_allclose(ours, theirs, atol=1e-12)
-    whole = []
-    for model in (body.pin, raw):
-        data = model.createData()
-        pin.ccrba(model, data, pin.neutral(model), np.zeros(model.nv))
-        whole.append(data.Ig.inertia)
-    np.testing.assert_allclose(*whole, atol=1e-12)
-    worst, _ = largest_difference(text, body)
-    assert worst < 1e-12
-
-
 def cosmik(data: Path, folder: Path) -> BodyModel:
     """A body whose table gives wrists as places on the forearms; it has no hands."""
     segments, points = {"torso": "torso", "pelvis": "pelvis"}, []
@@ -458,20 +405,6 @@ def test_implausible_lengths_are_warned_of(change: dict[str, float]) -> None:
     assert {d.code for d in diagnostics} <= {"model-implausible"}
     for diagnostic in diagnostics:
         assert f"is {change[diagnostic.place]:g} m long; adults have " in render(diagnostic).what
-
-
-@pytest.mark.parametrize("izz", ["-0.1", "9"])
-def test_inertias_that_nobody_has_are_read_as_pinocchio_does(izz: str, tmp_path: Path) -> None:
-    text = small().replace('<link name="torso"/>', f'<link name="torso">{inertial("50", izz)}</link>')
-    body, raw = load_model(written(tmp_path, text)), pin.buildModelFromXML(text)
-    [own], [theirs] = ([inertia for inertia in m.inertias if inertia.mass > 0.0] for m in (body.pin, raw))
-    np.testing.assert_allclose(own.matrix(), theirs.matrix(), atol=1e-12)
-
-
-def test_warnings_of_the_body_reach_the_summary(half_minute: Recording) -> None:
-    body = load_model(lengths={"left_upper_arm": 1.1})
-    diagnostics = map(from_json, summarize(track(half_minute, model=body)).content["diagnostics"])
-    assert [d.place for d in diagnostics if d.code == "model-implausible"] == ["left_upper_arm"]
 
 
 HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))
@@ -610,24 +543,6 @@ def test_a_wrong_table_says_so_in_one_line(case: str, tmp_path: Path) -> None:
         load_model(written(tmp_path, 'urdf = "small.urdf"\n' + text, "table.toml"))
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-def test_a_table_without_its_urdf_says_so(tmp_path: Path) -> None:
-    with pytest.raises(MissingFile, match=r"table\.urdf: no such file; a URDF is wanted"):
-        load_model(written(tmp_path, table_toml(), "table.toml"))
-
-
-def test_arms_that_point_up_need_their_axes(tmp_path: Path) -> None:
-    text = other_names(small()).replace("0 0 -0.3", "0 0 0.3").replace("0 0 -0.25", "0 0 0.25")
-    with pytest.raises(BadModel, match="opposite to its direction in the N-pose; name other links, or state its up"):
-        load_as(tmp_path, text)
-    down = {
-        name: f'{{link = "{link}", up = "-z", forward = "+x"}}' if "arm" in name or "hand" in name else link
-        for name, link in OTHER.items()
-    }
-    body = load_as(tmp_path, text, segments=down)
-    at = link_placements(body.pin, pin.neutral(body.pin))
-    np.testing.assert_allclose(at["left_forearm"][:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
 
 
 def test_a_breadth_gives_the_length_between_joint_centres() -> None:

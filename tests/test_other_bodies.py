@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import BodyModel, load_model
 from wepose_pin.body.kinematics import Pose, compute_pose
-from wepose_pin.body.table_file import format_table
+from wepose_pin.body.table import format_table
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.evaluation import evaluate
-from wepose_pin.readers.describe import describe_file
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report.track import render_track_report
 from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
@@ -209,20 +208,6 @@ def test_a_point_is_lost_where_a_segment_on_its_way_is(tracked: TrackResult) -> 
     points = find_measured_points(Motion(gaps, tracked.model, "squats", "here"))
     for point, there in points.items():
         assert np.isnan(there[150]).all() == (point in ("left_ankle", "left_toe")), point
-
-
-def test_info_proposes_its_segments(body: BodyModel, tmp_path: Path) -> None:
-    time = np.arange(0.0, 3.0, 0.01)
-    names = [
-        f"{place}_{signal}_{axis}" for place in ("femur_l", "sacrum") for signal in ("gyr", "acc") for axis in "xyz"
-    ]
-    rows = np.column_stack([time, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(time), 2))])
-    np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=",".join(["time", *names]), comments="")
-    session = describe_file(tmp_path / "d.csv", body=body.table, model=Path("whole_body")).session
-    assert session is not None
-    assert 'model = "whole_body"' in session
-    assert "[sensors.left_thigh]   # usually outside, above the knee" in session
-    assert "[sensors.pelvis]" in session
 
 
 # A robot --------------------------------------------------------------------------------------------------------------

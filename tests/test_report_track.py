@@ -16,8 +16,8 @@ from PIL import Image
 from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.covariance import compute_axis_std
 from wepose_pin.body.kinematics import Pose
+from wepose_pin.body.links import compute_axis_std
 from wepose_pin.body.subject import Hinge, population_subject
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import OrientationSensor, Recording

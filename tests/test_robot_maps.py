@@ -106,7 +106,7 @@ def test_the_page_has_the_keys_that_are_tested() -> None:
             "arms.right.elbow: no link 'foream' in arm.urdf; did you mean 'forearm'",
         ),
         ('"yaw"]', '"jaw"]', "arms.right.joints: no moving joint 'jaw' in arm.urdf; did you mean 'yaw'"),
-        ("[arms.right]", "[arms.middle]", "arms.middle is not a side"),
+        ("[arms.right]", "[arms.middle]", "arms.middle is not a known key"),
         ("shoulder =", "schoulder =", "arms.right.schoulder is not a known key; did you mean 'shoulder'"),
         ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
         ("elbow = -1.2", "elbo = -1.2", "rest: no moving joint 'elbo' in arm.urdf; did you mean 'elbow'"),

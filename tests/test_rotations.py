@@ -28,12 +28,6 @@ def test_exp_is_the_matrix_exponential(angle: float) -> None:
     np.testing.assert_allclose(Rotation.from_quat(quat).as_matrix(), matrix, atol=1e-14)
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-def test_log_undoes_exp(angle: float) -> None:
-    vector = angle * np.array([0.6, 0.0, -0.8])
-    np.testing.assert_allclose(rotations.log(rotations.exp(vector)), vector, atol=1e-12)
-
-
 @pytest.mark.parametrize("scale", [1e-3, 0.9, 1 - 1e-8, 1 - 1e-9, 1 + 1e-9, 1 + 1e-8, 1.1, 1e3])
 def test_the_compiled_step_renormalises_on_both_sides_of_its_switch(scale: float) -> None:
     start = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_quat()
@@ -51,8 +45,7 @@ def test_a_million_steps_stay_on_the_sphere() -> None:
 
 def test_orders_of_the_quaternion() -> None:
     xyzw = np.array([[0.1, 0.2, 0.3, 0.9], [0.0, 0.0, 0.0, 1.0]])
-    np.testing.assert_array_equal(rotations.wxyz_from_xyzw(xyzw)[0], [0.9, 0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(rotations.xyzw_from_wxyz(rotations.wxyz_from_xyzw(xyzw)), xyzw)
+    np.testing.assert_array_equal(rotations.xyzw_from_wxyz(xyzw[:, [3, 0, 1, 2]]), xyzw)
 
 
 @pytest.mark.parametrize(
@@ -65,11 +58,6 @@ def test_tilt_takes_accel_to_the_vertical_without_heading(up_S: list[float]) -> 
     np.testing.assert_allclose(up_W, [0, 0, 1], atol=1e-7)
     assert np.linalg.norm(quat) == pytest.approx(1.0)
     assert quat[2] == 0.0
-
-
-def test_tilt_of_nothing_is_an_error() -> None:
-    with pytest.raises(ValueError, match="zero acceleration"):
-        rotations.quat_from_gravity([0.0, 0.0, 0.0])
 
 
 def test_heading_is_the_twist_about_the_vertical() -> None:
@@ -124,11 +112,3 @@ def test_kernels_on_both_sides_of_their_switches(angle: float) -> None:
     np.testing.assert_allclose(R, start.as_matrix(), atol=1e-15)
     pure = np.append(angle / dt * axis, 0.0)
     np.testing.assert_allclose(derivative, 0.5 * rotations.multiply(start.as_quat(), pure), rtol=1e-13, atol=1e-300)
-
-
-def test_integrate_turns_step_by_step() -> None:
-    steps = np.random.default_rng(2).normal(scale=0.1, size=(50, 3))
-    total = Rotation.identity()
-    for step in steps:
-        total = total * Rotation.from_rotvec(step)
-    assert (total.inv() * Rotation.from_quat(rotations.integrate(steps)[-1])).magnitude() < 1e-13

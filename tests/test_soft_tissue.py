@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.body import load_model
 from wepose_pin.body.soft_tissue import SoftTissueCorrection, TissueMean, correct_table
 from wepose_pin.body.subject import Hinge, population_subject
-from wepose_pin.body.table_file import load_table
+from wepose_pin.body.table import load_table
 from wepose_pin.calibration import calibrate
 from wepose_pin.simulation import IDEAL_PRESET, PEOPLE_MEASURED_STD, PEOPLE_PRESET, simulate, simulate_person
 from wepose_pin.tracking import track

@@ -47,14 +47,6 @@ def test_stature_narrows_the_prior_and_left_follows_right() -> None:
     assert np.linalg.eigvalsh(wide.lengths_covariance())[0] > 0
 
 
-@pytest.mark.slow
-def test_people_drawn_have_the_priors_spread() -> None:
-    average, rng = population_subject(), np.random.default_rng(0)
-    drawn = np.array([[average.sample(rng).lengths[name] for name in LENGTHS] for _ in range(2000)])
-    np.testing.assert_allclose(drawn.mean(axis=0), [average.lengths[name] for name in LENGTHS], rtol=0.01)
-    np.testing.assert_allclose(drawn.std(axis=0), [average.std(name) for name in LENGTHS], rtol=0.06)
-
-
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     average = population_subject(1.8, "f")

@@ -19,7 +19,6 @@ from wepose_pin.errors import BadData
 from wepose_pin.filters import AmekfParams
 from wepose_pin.retargeting import ControllerParams
 from wepose_pin.simulation import Imperfections, ImuNoise
-from wepose_pin.tracking import TrackResult
 
 NAN, INF = float("nan"), float("inf")
 POSITIVE = ("100", NAN, INF, True, -1.0, 0.0)  # wrong for a number above 0
@@ -254,14 +253,6 @@ def test_the_name_that_is_meant_may_differ_in_case_and_hyphens() -> None:
     recording = replace(right()["track"]["recording"], start_pose="N-Pose")
     with pytest.raises(wp.WeposeError, match="did you mean 'n_pose'"):
         wp.track(recording)
-
-
-def test_an_unknown_point_lists_the_known_ones() -> None:
-    pose = right()["evaluate"]["pose"]
-    motion = TrackResult("x", pose, wp.load_model(), wp.population_subject())
-    with pytest.raises(KeyError, match=r"no point 'hand'; .*right_palm") as raised:
-        motion.points["hand"]
-    assert isinstance(raised.value, wp.WeposeError)
 
 
 def test_a_pose_or_a_truth_of_nan_is_refused() -> None:

@@ -158,21 +158,24 @@ def check_array(place: str, values: Any, shape: tuple[int, ...], kinds: str = "f
         raise BadData(f"{place} has the shape {values.shape}; {shape} is needed{rows}")
 
 
-def check_finite(place: str, values: np.ndarray, *, missing: bool = False) -> None:
-    """Check that numbers are finite; NaN is accepted where they may be `missing`."""
+def check_numbers(
+    place: str, values: Any, shape: tuple[int, ...], rows: str = "", *, missing: bool = False, unit: float = np.inf
+) -> None:
+    """Check as `check_array`, and that numbers are finite, or NaN where they may be `missing`.
+
+    `unit` : by how much the length of quaternions (…, 4) or directions (…, 3) may differ from 1
+    """
+    check_array(place, values, shape, rows=rows)
     wrong = np.isinf(values) if missing else ~np.isfinite(values)
     if wrong.any():
         k = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise BadData(f"{place}[{', '.join(map(str, k))}] = {values[k]:g}: a finite number is needed")
-
-
-def check_unit(place: str, values: np.ndarray, tolerance: float) -> None:
-    """Check that quaternions (…, 4) or directions (…, 3) have length 1; NaN, a missing one, is accepted."""
-    length = np.linalg.norm(values, axis=-1)
-    off = np.abs(np.nan_to_num(length, nan=1.0) - 1.0)
-    if np.max(off, initial=0.0) > tolerance:
-        what = "unit quaternion x, y, z, w" if values.shape[-1] == 4 else "unit vector"
-        raise BadData(f"{place}: no {what}: length {length.flat[int(np.argmax(off))]:.6g}")
+    if np.isfinite(unit):
+        length = np.linalg.norm(values, axis=-1)
+        off = np.abs(np.nan_to_num(length, nan=1.0) - 1.0)
+        if np.max(off, initial=0.0) > unit:
+            what = "unit quaternion x, y, z, w" if shape[-1] == 4 else "unit vector"
+            raise BadData(f"{place}: no {what}: length {length.flat[int(np.argmax(off))]:.6g}")
 
 
 def check_names(place: str, names: Collection[str], known: Collection[str], otherwise: str = "") -> None:

@@ -51,18 +51,15 @@ def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Ca
         dispatcher = njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor a home is writable
         return njit(**options)(function)
-    cache = getattr(dispatcher, "_cache", None)
-    if cache is not None:  # with a full disk it compiles again the next time
-        cache.save_overload = _ignore_full_disk(cache.save_overload)
+    if (cache := getattr(dispatcher, "_cache", None)) is not None:
+        save = cache.save_overload
+
+        def try_to_save(*args: Any) -> None:
+            with contextlib.suppress(OSError):  # with a full disk it compiles again the next time
+                save(*args)
+
+        cache.save_overload = try_to_save
     return dispatcher
-
-
-def _ignore_full_disk(save: Callable[..., None]) -> Callable[..., None]:
-    def try_to_save(*args: Any) -> None:
-        with contextlib.suppress(OSError):
-            save(*args)
-
-    return try_to_save
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import os
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -45,7 +44,7 @@ def read_table(path: Path) -> pl.DataFrame:
     """
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            return pl.read_parquet(open_source(path))
+            return pl.read_parquet(path)
     layout = read_layout(path)
     body = read_body(path, layout.head_lines)
     names = [
@@ -73,7 +72,7 @@ def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
     """Read the names of a table's columns, and the units of those that have one in a line of a CSV."""
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            return list(pl.read_parquet_schema(open_source(path))), {}
+            return list(pl.read_parquet_schema(path)), {}
     layout = read_layout(path)
     return list(layout.names), dict(zip(layout.names, layout.units, strict=False))
 
@@ -160,12 +159,11 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
         if bad.any():
             row = int(bad.arg_max() or 0)
             text = stripped[row]
-            numeric = text.replace(",", ".", 1).replace("-", "").replace(".", "", 1).isdigit()
-            right = f"write decimals with a point: {text.replace(',', '.', 1)}" if numeric else "it must be a number"
+            numeric = re.fullmatch(r"-?\d*,\d*", text)
+            right = f"write decimals with a point: {text.replace(',', '.')}" if numeric else "it must be a number"
             raise BadData(f"{file}: column '{name}' holds text in row {row + 1}: '{text[:40]}'; {right}")
     elif not series.dtype.is_numeric() and series.dtype != pl.Null:
-        content = "true and false" if series.dtype == pl.Boolean else f"values of type {series.dtype}"
-        raise BadData(f"{file}: column '{name}' holds {content}; it must hold numbers")
+        raise BadData(f"{file}: column '{name}' holds values of type {series.dtype}; it must hold numbers")
     numbers = series.cast(pl.Float64)
     if numbers.is_infinite().any():
         row = int(numbers.is_infinite().arg_max() or 0)
@@ -174,15 +172,6 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
 
 
 # Checks of files ---------------------------------------------------------------------------------------------------
-
-
-def open_source(path: Path) -> Path | bytes:
-    """Return the file as a path, or its contents where the path is not UTF-8, which polars cannot open."""
-    try:
-        os.fspath(path).encode("utf-8")
-    except UnicodeEncodeError:
-        return path.read_bytes()
-    return path
 
 
 def _is_parquet(path: Path) -> bool:
@@ -210,7 +199,7 @@ class CsvLayout(NamedTuple):
 
 
 def read_layout(path: Path) -> CsvLayout:
-    """Find the separator, the decimal sign and the line of names of a CSV.
+    """Find the separator and the line of names of a CSV.
 
     The names are in the first line that is no comment. Where the first row of numbers has another number of cells,
     they are in the line right above that row, or above a line of units.
@@ -234,17 +223,14 @@ def read_layout(path: Path) -> CsvLayout:
         text = [(k, line.decode("cp1252", errors="replace").rstrip("\r\n")) for k, line in lines]
     stated = re.fullmatch(r'"?sep=(.|\\t)"?[;,\t]*', text[0][1])  # a hint for spreadsheets
     text = text[1:] if stated and len(text) > 1 else text
-    separator = stated[1].replace("\\t", "\t") if stated else _find_separator([line for _, line in text])
+    # Semicolons or tabs where most lines have them, else commas.
+    separator = next((sign for sign in ";\t" if 2 * sum(sign in line for _, line in text) > len(text)), ",")
+    separator = stated[1].replace("\\t", "\t") if stated else separator
     with library_errors(path, "a CSV"):
         rows = [(k, next(csv.reader([line], delimiter=separator), [])) for k, line in text]
     (first, last), units = _find_names([cells for _, cells in rows])
     names = _join_names([cells for _, cells in rows[first:last]])
     return CsvLayout(names, units, separator, rows[last if units else last - 1][0] + 1)
-
-
-def _find_separator(lines: Sequence[str]) -> str:
-    """Find the separator: semicolons or tabs where most lines have them, else commas."""
-    return next((sign for sign in ";\t" if 2 * sum(sign in line for line in lines) > len(lines)), ",")
 
 
 def _find_names(rows: Sequence[Sequence[str]]) -> tuple[tuple[int, int], list[str]]:

@@ -36,22 +36,14 @@ MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are shown 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """Something that a user should know; ``str(diagnostic)`` is its text.
+    """Something that a user should know; ``str(diagnostic)`` is its text."""
 
-    Parameters
-    ----------
-    code : stable, in the catalogue, listed in docs/diagnostics.md
-    severity : how much it weighs
-    place : segment, sensor, joint, length, phase or file that it is about
-    value, limit : what was found and what it should keep to, SI
-    facts : what the text needs besides, SI; ``variant`` names the text where a code has several
-    """
-
-    code: str
-    severity: Severity
-    place: str = ""
-    value: float | None = None
-    limit: float | None = None
+    code: str  # stable, in the catalogue, listed in docs/diagnostics.md
+    severity: Severity  # how much it weighs
+    place: str = ""  # segment, sensor, joint, length, phase or file that it is about
+    value: float | None = None  # what was found, SI
+    limit: float | None = None  # what it should keep to, SI
+    # What the text needs besides, SI; ``variant`` names the text where a code has several.
     facts: Mapping[str, float | str] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -142,20 +134,14 @@ def drop_consequences(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
 def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
     """The diagnostic with its text, for a JSON file; numbers that are not finite become null."""
 
-    def number(value: float | str | None) -> float | str | None:
+    def convert(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: convert(fact) for name, fact in value.items()}
         if value is None or isinstance(value, str):
             return value
         return float(value) if math.isfinite(value) else None
 
-    return {
-        "code": diagnostic.code,
-        "severity": diagnostic.severity.value,
-        "place": diagnostic.place,
-        "value": number(diagnostic.value),
-        "limit": number(diagnostic.limit),
-        "facts": {name: number(fact) for name, fact in diagnostic.facts.items()},
-        "text": render(diagnostic)._asdict(),
-    }
+    return {name: convert(getattr(diagnostic, name)) for name in _SAVED} | {"text": render(diagnostic)._asdict()}
 
 
 def from_json(content: Mapping[str, Any]) -> Diagnostic:
@@ -167,28 +153,23 @@ def from_json(content: Mapping[str, Any]) -> Diagnostic:
 # Numbers --------------------------------------------------------------------------------------------------------------
 
 
-class _Unit(NamedTuple):
-    factor: float  # from SI
-    name: str  # with the space before it
-    digits: int = 2  # significant ones, at least
-
-
+# Unit → factor from SI, name with the space before it, and least number of significant digits.
 _UNITS = {
-    "deg": _Unit(180.0 / math.pi, "°"),
-    "deg/s": _Unit(180.0 / math.pi, "°/s"),
-    "deg/min": _Unit(60.0 * 180.0 / math.pi, "°/min"),
-    "rad/s": _Unit(1.0, " rad/s", 3),
-    "mm": _Unit(1e3, " mm"),
-    "m": _Unit(1.0, " m", 3),
-    "m/s2": _Unit(1.0, " m/s²", 3),
-    "s": _Unit(1.0, " s"),
-    "ms": _Unit(1e3, " ms"),
-    "time": _Unit(1.0, " s", 15),  # as it stands in the file
-    "hz": _Unit(1.0, " Hz", 4),
-    "kg": _Unit(1.0, " kg", 3),
-    "percent": _Unit(100.0, " %"),
-    "count": _Unit(1.0, ""),
-    "number": _Unit(1.0, ""),
+    "deg": (180.0 / math.pi, "°", 2),
+    "deg/s": (180.0 / math.pi, "°/s", 2),
+    "deg/min": (60.0 * 180.0 / math.pi, "°/min", 2),
+    "rad/s": (1.0, " rad/s", 3),
+    "mm": (1e3, " mm", 2),
+    "m": (1.0, " m", 3),
+    "m/s2": (1.0, " m/s²", 3),
+    "s": (1.0, " s", 2),
+    "ms": (1e3, " ms", 2),
+    "time": (1.0, " s", 15),  # as it stands in the file
+    "hz": (1.0, " Hz", 4),
+    "kg": (1.0, " kg", 3),
+    "percent": (100.0, " %", 2),
+    "count": (1.0, "", 2),
+    "number": (1.0, "", 2),
 }
 
 

@@ -56,20 +56,12 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TomlTable:
-    """A TOML table with its place, which begins each error's text.
-
-    Parameters
-    ----------
-    values : key → value
-    file : the file, or another beginning of an error's text
-    place : its name in the file with a dot at the end, such as ``sensors.torso.``
-    error : the kind of error to raise
-    """
+    """A TOML table with its place, which begins each error's text."""
 
     values: Mapping[str, Any]
-    file: str
-    place: str = ""
-    error: type[WeposeError] = BadSession
+    file: str  # or another beginning of an error's text
+    place: str = ""  # its name in the file with a dot at the end, such as ``sensors.torso.``
+    error: type[WeposeError] = BadSession  # the kind of error to raise
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -106,13 +98,6 @@ class TomlTable:
             raise self.error(f"{self.at(key)} = {value!r} is no list of tables; write [[{self.place}{key}]]")
         return [replace(self, values=each, place=f"{self.place}{key} {k + 1}.") for k, each in enumerate(value)]
 
-    def tables(self, names: Collection[str], kind: str) -> dict[str, TomlTable]:
-        """Return name → table of all its tables; a name that is not in `names` is not a `kind`."""
-        for name in self.values:
-            if name not in names:
-                raise self.error(f"{self.at(name)} is not a {kind}; {one_of(names, name)}")
-        return {name: self.table(name) for name in self.values}
-
     def text(self, key: str, default: str | None) -> str | None:
         """Return a text that is not empty; `default` where the key is missing."""
         value = self.values.get(key, default)
@@ -143,14 +128,13 @@ class TomlTable:
             raise self.error(f"{self.at(key)} = {value!r} is neither true nor false")
         return value
 
-    def number(self, key: str, default: float | None, positive: bool = False) -> float | None:
+    def number(self, key: str, default: float | None) -> float | None:
         """Return a finite number; `default` where the key is missing."""
         value = self.values.get(key, default)
         if value is None:
             return None
-        if not is_number(value) or (positive and value <= 0):
-            wanted = "must be greater than 0" if is_number(value) else "is not a number"
-            raise self.error(f"{self.at(key)} = {_format_value(value)} {wanted}")
+        if not is_number(value):
+            raise self.error(f"{self.at(key)} = {_format_value(value)} is not a number")
         return float(value)
 
     def names(self, key: str, count: int) -> list[str]:
@@ -209,32 +193,19 @@ class Key:
     A field without it has a key of its own name; with None in its place the table has no such field. Fields are texts,
     numbers, flags, tuples of texts or of up to three numbers, arrays (k,) with `each`, NamedTuples, lists of those, and
     mappings of names to any of them, each a table. In place of a NamedTuple's table its first field alone may stand.
-
-    Parameters
-    ----------
-    name : of the key; empty: that of the field and the unit, ``softness_deg``
-    unit : of the file's numbers; of deg, deg_min and mm the field is in rad, rad/s and m
-    least, most : limits of each number, in the file's unit
-    of : what texts name; `read_record` is given the names that there are
-    words : text in the file → value of the field
-    omit_zero : zeros are not written
-    each : the keys of an array's numbers
-    unread : keys beside those, in tables of arrays, that are written for whoever looks at the file
-    digits : decimals that are written; None: all that count
-    comment : is written behind the heading of a table
     """
 
-    name: str = ""
-    unit: str = ""
-    least: float = -1e6
+    name: str = ""  # empty: that of the field and the unit, ``softness_deg``
+    unit: str = ""  # of the file's numbers; of deg, deg_min and mm the field is in rad, rad/s and m
+    least: float = -1e6  # limits of each number, in the file's unit
     most: float = 1e6
-    of: str = ""
-    words: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    omit_zero: bool = False
-    each: tuple[str, ...] = ()
-    unread: tuple[str, ...] = ()
-    digits: int | None = None
-    comment: str = ""
+    of: str = ""  # what texts name; `read_record` is given the names that there are
+    words: Mapping[str, Any] = field(default_factory=dict, hash=False)  # text in the file → value of the field
+    omit_zero: bool = False  # zeros are not written
+    each: tuple[str, ...] = ()  # the keys of an array's numbers
+    unread: tuple[str, ...] = ()  # keys beside those, in tables of arrays, written for whoever looks at the file
+    digits: int | None = None  # decimals that are written; None: all that count
+    comment: str = ""  # behind the heading of a table
 
 
 @cache

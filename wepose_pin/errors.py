@@ -15,9 +15,8 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-LONGEST = 2000  # letters of an error's text
+LONGEST, END = 2000, 500  # letters of an error's text, and of its end, which says what would be right
 ALIKE = 0.6  # likeness of two names, from which on one may be meant by the other
-_END = 500  # of these, what is kept of the end, where it says what would be right
 
 
 class WeposeError(Exception):
@@ -29,7 +28,7 @@ class WeposeError(Exception):
 
     def __str__(self) -> str:
         text = printable(Exception.__str__(self))  # not that of KeyError, which is a repr
-        return text if len(text) <= LONGEST else f"{text[: LONGEST - _END]} … {text[-_END:]}"
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - END]} … {text[-END:]}"
 
 
 class MissingFile(WeposeError):
@@ -49,12 +48,7 @@ class UnknownKey(WeposeError, KeyError):
 
 
 class Named(dict[str, T]):
-    """Values by name; an unknown name raises `UnknownKey`, which lists the known ones.
-
-    Parameters
-    ----------
-    kind : what the names are, such as "point"
-    """
+    """Values by name, of a `kind` such as "point"; an unknown name raises `UnknownKey`, which lists the known ones."""
 
     def __init__(self, kind: str, values: Mapping[str, T]) -> None:
         super().__init__(values)
@@ -73,14 +67,7 @@ class BadData(WeposeError):
 
 
 class WrongUnit(BadData):
-    """Numbers that are those of another unit.
-
-    Parameters
-    ----------
-    finding : what shows it
-    key, unit : what would fit in a session's [data], as ``gyro_unit`` and ``deg/s``
-    otherwise : what else can be wrong
-    """
+    """Numbers of another unit: what shows it, what would fit in a session's [data], and what else can be wrong."""
 
     def __init__(self, finding: str, key: str = "", unit: str = "", otherwise: str = "") -> None:
         super().__init__(f'{finding}; data.{key} = "{unit}" would fit{otherwise}')
@@ -108,13 +95,7 @@ class BadOption(WeposeError, ValueError):
 
 
 class WrongOption(BadOption):
-    """An option of a command whose value is not possible.
-
-    Parameters
-    ----------
-    name, value : as on the command line, the name without ``--``
-    needed : what is wrong, or what would be right
-    """
+    """An option of a command whose value is not possible; its name is without ``--``."""
 
     def __init__(self, name: str, value: object, needed: str) -> None:
         super().__init__(f"--{name} {value}: {needed}")
@@ -143,8 +124,6 @@ class NoSolution(WeposeError):
 
 def printable(text: str) -> str:
     """The text in one line, control characters escaped: what a file holds must not steer a terminal."""
-    if text.isprintable():
-        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
@@ -154,19 +133,14 @@ _muting = threading.RLock()
 @contextlib.contextmanager
 def native_stderr_muted() -> Iterator[None]:
     """What libraries in C++ and Rust print on stderr meanwhile is dropped: their errors are told in a line of ours."""
-    with _muting:
-        try:
-            kept = os.dup(2)
-        except OSError:  # there is none
-            yield
-            return
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+    with _muting, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # there is none
+            stderr = os.dup(2)
+            stack.callback(os.close, stderr)
+            stack.callback(os.dup2, stderr, 2)
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+        yield
 
 
 def reason(error: Exception) -> str:
@@ -181,21 +155,15 @@ def how_to_install(*packages: str) -> str:
 
 
 def one_of(names: Iterable[str], value: str | None = None, most: int = 12) -> str:
-    """The choices for an error's end: ``a, b, c`` with the closest to `value` named first.
-
-    Of more than `most` those are listed that are nearest to `value`, the nearest first.
-    """
+    """The choices for an error's end: ``a, b, c``, of more than `most` those nearest to `value`, and a guess."""
     choices = list(names)
-    likeness = {name: _compare(value or "", name) for name in choices}
+
+    def simplify(name: str) -> str:
+        return name.lower().replace("-", "_").replace(" ", "_")
+
+    likeness = {name: SequenceMatcher(None, simplify(value or ""), simplify(name)).ratio() for name in choices}
     nearest = sorted(choices, key=lambda name: -likeness[name])
     shown = nearest if value and len(choices) > most else choices
     listed = ", ".join(shown[:most]) + (f", … ({len(choices)} in all)" if len(choices) > most else "")
-    if value and choices and likeness[nearest[0]] >= ALIKE:
-        return f"did you mean '{nearest[0]}'? there is: {listed}"
-    return f"there is: {listed or 'none'}"
-
-
-def _compare(name: str, other: str) -> float:
-    """Likeness of two names, 1 where they differ in case and hyphens alone."""
-    plain, other = (each.lower().replace("-", "_").replace(" ", "_") for each in (name, other))
-    return SequenceMatcher(None, plain, other).ratio()
+    guess = f"did you mean '{nearest[0]}'? " if value and choices and likeness[nearest[0]] >= ALIKE else ""
+    return f"{guess}there is: {listed or 'none'}"

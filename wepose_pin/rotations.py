@@ -22,11 +22,6 @@ def xyzw_from_wxyz(quat_wxyz: ArrayLike) -> np.ndarray:
     return np.roll(np.asarray(quat_wxyz, dtype=float), -1, axis=-1)
 
 
-def wxyz_from_xyzw(quat_xyzw: ArrayLike) -> np.ndarray:
-    """Reorder quaternions (..., 4) from scalar last to scalar first."""
-    return np.roll(np.asarray(quat_xyzw, dtype=float), 1, axis=-1)
-
-
 def product_terms(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped-def]
     """``a ⊗ b`` of the components of two quaternions, numbers, arrays or symbols, as four."""
     return (

@@ -112,7 +112,7 @@ def _imufusion(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: S
     )
     # The same start as the others; its own would fix the heading for three seconds.
     quat_start = rotations.quat_from_gravity(accel_S[: StaticTest().samples(rate_hz)].mean(axis=0))
-    ahrs.set_quaternion(rotations.wxyz_from_xyzw(quat_start)).skip_startup()
+    ahrs.set_quaternion(np.roll(quat_start, 1)).skip_startup()
     gyro, accel = np.degrees(gyro_S), accel_S / noise.gravity  # [deg/s], [g]
     quat_wxyz = np.empty((len(gyro), 4))
     for k in range(len(gyro)):

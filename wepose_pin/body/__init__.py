@@ -9,21 +9,20 @@ What there is on a body stands in a table beside its URDF (`BodyTable`): segment
 pairs. In a `BodyModel` links bear the names of segments and points, in our frames; a body of others gets massless links
 for them, fixed to its own.
 
-`table` and `table_file` have the table, `tree` the joints and the links by the table's names, `lengths` measures and
-stretches and has the way from the root to each point, and `body` is what they make. A person's numbers stand in
-`subject`, those of all people in `anthropometry`.
+`table` is what stands on a body, and its file; `tree` the joints and the links by the table's names; `lengths` measures
+and stretches and has the way from the root to each point; `body` is what they make. A person's numbers stand in
+`subject`, those of all people in `anthropometry`, `mounts` finds how sensors are mounted from the start pose.
 
-`configuration` solves for the joints from orientations of segments, `links` places links and points, `kinematics` does
-both (`Pose`), `covariance` says how well points are known.
+`configuration` solves for the joints from orientations of segments, `links` places links and points and says how well
+they are known, `kinematics` does both (`Pose`).
 """
 
 from .anthropometry import SEXES, convert_breadths, list_breadths
 from .body import BodyModel, load_model
 from .girdle import Girdle
 from .lengths import LinkVector
-from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb
-from .table_file import load_table
-from .visuals import Visual
+from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, load_table
+from .urdf import Visual
 
 __all__ = [
     "DEFAULT_BODY",

@@ -31,15 +31,10 @@ def check_stature(stature: float | None) -> None:
 
 
 def compute_population_lengths(table: BodyTable, stature: float | None = None, sex: str | None = None) -> LengthPrior:
-    """The lengths of a table that people have; of those that name a share of stature.
+    """The lengths of a table that people have, which name a share of stature, for `stature` [m] and `sex`.
 
     Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and
     sources stand in ``calibration/anthropometry.toml``.
-
-    Parameters
-    ----------
-    stature : body height [m]; None: 1.75 with the spread of adults
-    sex : "f", "m", or None for the mean of both
     """
     check_stature(stature)
     if sex is not None and sex not in SEXES:
@@ -67,19 +62,14 @@ def compute_population_lengths(table: BodyTable, stature: float | None = None, s
     return LengthPrior(tuple(names), mean, covariance, f"population prior ({known})")
 
 
-class Breadth(NamedTuple):
-    """What a tape reaches in place of a length between joint centres: the length is a ratio of it."""
+def list_breadths(table: BodyTable) -> dict[str, tuple[str, float, float]]:
+    """Breadth → the length between joint centres that it gives, its ratio to the breadth, and the ratio's std.
 
-    length: str
-    ratio: float
-    std: float  # of the ratio
-
-
-def list_breadths(table: BodyTable) -> dict[str, Breadth]:
-    """The breadths that give lengths of a body, name → breadth; sources in ``calibration/anthropometry.toml``."""
+    Sources stand in ``calibration/anthropometry.toml``.
+    """
     of_share = {length.share: name for name, length in table.lengths.items()}
     return {
-        name: Breadth(of_share[entry["share"]], entry["ratio"], entry["std"])
+        name: (of_share[entry["share"]], entry["ratio"], entry["std"])
         for name, entry in _read_numbers()["breadths"].items()
         if entry["share"] in of_share
     }
@@ -94,14 +84,10 @@ def convert_breadths(
     """
     breadths, converted = list_breadths(table), {}
     for name, metres in measured.items():
-        breadth = breadths.get(name)
-        if breadth is None:
-            converted[name] = (metres, measured_std)
-        elif breadth.length in measured:
-            raise BadOption(f"measured {name} and {breadth.length}: one follows from the other; give one of them")
-        else:
-            std = float(np.hypot(breadth.std * metres, breadth.ratio * measured_std))
-            converted[breadth.length] = (breadth.ratio * metres, std)
+        length, ratio, std = breadths.get(name, (name, 1.0, 0.0))
+        if length != name and length in measured:
+            raise BadOption(f"measured {name} and {length}: one follows from the other; give one of them")
+        converted[length] = (ratio * metres, float(np.hypot(std * metres, ratio * measured_std)))
     return converted
 
 

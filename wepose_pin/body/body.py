@@ -17,16 +17,13 @@ from ..assets import asset
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadSession, one_of
 from . import lengths as _lengths
-from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
 from .lengths import LinkVector, measure_reaches
 from .soft_tissue import TissueMean
-from .table import DEFAULT_BODY, BodyTable, Segment
-from .table_file import find_table, load_table, read_table
+from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, read_table
 from .tree import MOST_LINKS, build, check_joint_values, parse_tree, rename_links
-from .urdf import import_yourdfpy, read_urdf
-from .visuals import Visual
+from .urdf import Visual, import_yourdfpy, list_visuals, read_urdf
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
 FAR_OFF = 5.0
@@ -140,7 +137,7 @@ class BodyModel:
     @cached_property
     def visuals(self) -> list[Visual]:
         """The visuals of all links."""
-        return _visuals.visuals(self.robot)
+        return list_visuals(self.robot)
 
     def with_lengths(self, lengths: Mapping[str, float]) -> BodyModel:
         """The same body with other lengths [m]; those not named stay.
@@ -157,10 +154,9 @@ class BodyModel:
             if name not in own:
                 raise BadModel(f"{self.robot.name}: the model has no length '{name}'; {one_of(own, name)}")
             if not 0.0 < value < 10.0:
-                raise BadModel(
-                    f"{self.robot.name}: length {name} = {value!r} is no length of a body: above 0 and below 10 m"
-                )
-        body = _body(_lengths.with_lengths(self.robot, self.table, lengths), self.table, self.robot.name)
+                raise BadModel(f"{self.robot.name}: length {name} = {value!r}: above 0 and below 10 m is needed")
+        robot = _lengths.with_lengths(self.robot, self.table, lengths)
+        body = _body(robot, self.table, robot.name)
         return replace(body, girdles=self.girdles, tissue_means=self.tissue_means)
 
     def urdf(self) -> str:
@@ -179,12 +175,15 @@ class BodyModel:
 
 
 def _find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
-    """Find segment → its chain, for segments that the model has, in the order of Pinocchio's joints."""
     frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
     at: dict[int, str] = {}  # joint → the first of the segments that it carries; the others are rigid with that
     for segment, frame in frames.items():
         at.setdefault(frame.parentJoint, segment)
-    paths = {segment: _find_path(model, joint, at) for joint, segment in at.items()}
+    paths: dict[str, tuple[str | None, list[int]]] = {}  # segment → the one above, and the joints between
+    for joint, segment in at.items():
+        path = model.supports[joint].tolist()
+        below = max((k for k, other in enumerate(path[:-1]) if other in at), default=None)
+        paths[segment] = (None, path[1:]) if below is None else (at[path[below]], path[below + 1 :])
     # A joint that moves two segments at once rests.
     times = Counter(joint for _, joints in paths.values() for joint in joints)
     chains = {}
@@ -196,13 +195,6 @@ def _find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
         spherical = [joint for joint in free if model.nvs[joint] == 3]
         chains[segment] = Chain(tuple(free), spherical[-1] if spherical else None, above)
     return chains
-
-
-def _find_path(model: pin.Model, joint: int, at: Mapping[int, str]) -> tuple[str | None, list[int]]:
-    """Find the segment above that which `joint` carries, None: the root, and the joints from there down to `joint`."""
-    path = model.supports[joint].tolist()
-    above = [k for k, other in enumerate(path[:-1]) if other in at]
-    return (at[path[above[-1]]], path[above[-1] + 1 :]) if above else (None, path[1:])
 
 
 def load_model(path: str | Path | None = None, lengths: Mapping[str, float] | None = None) -> BodyModel:
@@ -254,14 +246,14 @@ def _load_packaged_body(path: Path) -> BodyModel:
 
 def _load_body(path: Path) -> BodyModel:
     """Return the body of a URDF or of a table that names one."""
-    table: BodyTable | None = None
-    urdf, is_table = path, path.suffix.lower() == ".toml"
-    if is_table:
-        table = read_table(path)
-        urdf = path.parent / table.urdf
+    table = read_table(path) if path.suffix.lower() == ".toml" else None
+    urdf = path if table is None else path.parent / table.urdf
     robot = read_urdf(urdf)
     links = parse_tree(robot, str(urdf)).below
-    table = table or find_table(urdf, links)
+    if table is not None:
+        for pose, values in table.poses.items():
+            check_joint_values(robot, values, f"{table.where}: poses.{pose}", BadModel)
+    by_table, table = table is not None, table or find_table(urdf, links)
     if table is None:
         default = load_table()
         lacking = [name for name in default.needed if default.segments[name].link not in links]
@@ -269,20 +261,23 @@ def _load_body(path: Path) -> BodyModel:
             f"{urdf}: no link {', '.join(map(repr, lacking))}; name the segments' links in a table, as docs/models.md "
             f'shows (of a robot with kind = "mechanism"); {one_of(links, most=MOST_LINKS)}'
         )
-    joints = {joint.name for joint in robot.joints}
-    for pose, values in table.poses.items() if is_table else ():
-        check_joint_values(robot, values, f"{table.where}: poses.{pose}", BadModel)
     # Of a table for several URDFs the names of links fit; joints may have others.
+    joints = {joint.name for joint in robot.joints}
     table = replace(
         table,
         girdles={name: girdle for name, girdle in table.girdles.items() if joints.issuperset(girdle.joints)},
         poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)},
     )
     body = _body(*rename_links(robot, table), str(urdf))
-    _check_segments_move(body, body.table)
-    if is_table:
-        longer = {name: 1.1 * value for name, value in body.lengths.items()}
-        _lengths.with_lengths(body.robot, body.table, longer)  # raises where the table does not give them
+    for segment in body.table.needed:
+        above = body.parents[segment]
+        if above is not None and not body.chains[segment].joints:
+            raise BadModel(f"{table.where}: no joint moves {segment} against {above}; revolute joints are needed there")
+    for name, hinge in body.table.hinges.items():
+        if body.parents[hinge.moves] != hinge.on:
+            raise BadModel(f"{table.where}: hinges.{name} is none: {hinge.moves} does not hang on {hinge.on}")
+    if by_table:  # an error where the table does not give its lengths
+        _lengths.with_lengths(body.robot, body.table, {name: 1.1 * value for name, value in body.lengths.items()})
     return body
 
 
@@ -307,9 +302,8 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
         if name not in tree.below:
             choices = one_of(tree.below, name, MOST_LINKS)
             raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
-    segments = {
-        name: Segment.of_mechanism(name, rigid=True) for name in sorted(sensors, key=lambda name: len(tree.path(name)))
-    }
+    links = sorted(sensors, key=lambda name: len(tree.path(name)))
+    segments = {name: Segment.of_mechanism(name, rigid=True) for name in links}
     body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
     if not body.pin.nv:
         raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")
@@ -317,24 +311,13 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
 
 
 def _find_body(path: str | Path | None) -> Path:
-    """The file of a body: ours by its name, else the path itself."""
+    """Find the file of a body: ours by its name, else the path itself."""
     if path is None:
         return asset("urdf", f"{DEFAULT_BODY}.urdf")
     path = Path(path)
     if path.suffix or path.exists() or len(path.parts) > 1:
         return path
     return asset("urdf", f"{load_table(path.name).name}.toml")
-
-
-def _check_segments_move(body: BodyModel, table: BodyTable) -> None:
-    """Raise `BadModel` on segments that no joint moves against the one above, and on hinges between no neighbours."""
-    for segment in table.needed:
-        above = body.parents[segment]
-        if above is not None and not body.chains[segment].joints:
-            raise BadModel(f"{table.where}: no joint moves {segment} against {above}; revolute joints are needed there")
-    for name, hinge in table.hinges.items():
-        if body.parents[hinge.moves] != hinge.on:
-            raise BadModel(f"{table.where}: hinges.{name} is none: {hinge.moves} does not hang on {hinge.on}")
 
 
 def _body(robot: Any, table: BodyTable, where: str) -> BodyModel:

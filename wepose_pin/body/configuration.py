@@ -24,7 +24,7 @@ from ..rotations import conjugate, exp, log, multiply, product, rotation_about
 from .body import BodyModel
 from .girdle import displace_one, find_girdle_scale
 from .links import compute_link_poses, find_columns
-from .table_file import check_segments
+from .table import check_segments
 
 _MEET_TOLERANCE = 1e-6  # [m] between joints of one place
 _ROUNDS = 100  # of a fit; two to four are the rule from the frame before

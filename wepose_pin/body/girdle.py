@@ -38,39 +38,23 @@ _Std = Annotated[tuple[float, float, float], Key(unit="mm", least=0.0)]
 
 
 class Girdle(NamedTuple):
-    """How the first point of a limb moves on the segment on which the limb hangs.
+    """How the first point of a limb moves on the segment on which the limb hangs; std: one standard deviation."""
 
-    Parameters
-    ----------
-    on, moves : segments; the limb hangs on `on` and begins with `moves`
-    joints : of the URDF, which slide along x, y and z of `on`
-    outward : (3,) axis of `on` that points away from the body's middle
-    up, middle : (2,) [m] (a, b) and (f, g) of the law
-    back : (2,) [m] (c, d) of the law
-    back_angle : ε [rad] of the law
-    scaled_by : length that scales the law; empty: it is not scaled
-    scale : [m] that length where the law's scale is one
-    law_std : of the share by which a person's law is more or less
-    rest_std, raised_std : (3,) [m] of a person's other parameters, one standard deviation
-    alike : correlation of both sides' law and place at rest
-    residual_std : (3,) [m] by which the point leaves law and parameters
-    """
-
-    on: SegmentName
-    moves: SegmentName
-    joints: tuple[str, str, str]
-    outward: Direction
-    up: _Pair
-    middle: _Pair
-    back: _Pair
-    back_angle: Annotated[float, Key(unit="deg", least=0.01)]
-    scaled_by: Annotated[str, Key(of="lengths")] = ""
-    scale: Annotated[float, Key("scale", "m", least=1e-3)] = 1.0
-    law_std: Annotated[float, Key(least=0.0)] = 0.0
-    rest_std: _Std = (0.0, 0.0, 0.0)
+    on: SegmentName  # on which the limb hangs
+    moves: SegmentName  # with which the limb begins
+    joints: tuple[str, str, str]  # of the URDF, which slide along x, y and z of `on`
+    outward: Direction  # axis of `on` that points away from the body's middle
+    up: _Pair  # [m] (a, b) of the law
+    middle: _Pair  # [m] (f, g)
+    back: _Pair  # [m] (c, d)
+    back_angle: Annotated[float, Key(unit="deg", least=0.01)]  # ε [rad]
+    scaled_by: Annotated[str, Key(of="lengths")] = ""  # length that scales the law; empty: it is not scaled
+    scale: Annotated[float, Key("scale", "m", least=1e-3)] = 1.0  # [m] that length where the law's scale is one
+    law_std: Annotated[float, Key(least=0.0)] = 0.0  # of the share by which a person's law is more or less
+    rest_std: _Std = (0.0, 0.0, 0.0)  # [m] of a person's other parameters
     raised_std: _Std = (0.0, 0.0, 0.0)
-    alike: Annotated[float, Key(least=-0.999, most=0.999)] = 0.0
-    residual_std: _Std = (0.0, 0.0, 0.0)
+    alike: Annotated[float, Key(least=-0.999, most=0.999)] = 0.0  # correlation of both sides' law and place at rest
+    residual_std: _Std = (0.0, 0.0, 0.0)  # [m] by which the point leaves law and parameters
 
     @property
     def law(self) -> tuple[float, ...]:

@@ -11,14 +11,13 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..arguments import check_array, check_fields, check_finite, check_names, check_unit
+from ..arguments import check_array, check_fields, check_names, check_numbers
 from ..errors import BadData, one_of
 from ..recording import EACH_TIME, check_time, format_span
 from ..rotations import unwrap_signs
 from .body import BodyModel
 from .configuration import ConfigurationSolver
-from .covariance import compute_axis_std
-from .links import compute_joint_values, compute_link_poses, find_known_points
+from .links import compute_axis_std, compute_joint_values, compute_link_poses, find_known_points
 
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
 MAX_TABLE_NORM_DEVIATION = 1e-2  # the same in a table: a file may have few decimals
@@ -72,21 +71,20 @@ class Pose:
         if not n:
             raise BadData(f"{where}time has no samples")
         check_time("pose", self.time)
-        for name, known, shape, kinds in (
-            ("quat_WL", self.quat_WL, (n, 4), "fiu"),
-            ("points", self.points, (n, 3), "fiu"),
-            ("segment_cov", self.quat_WL, (n, 3, 3), "fiu"),
-            ("point_cov", self.points, (n, 3, 3), "fiu"),
-            ("gap", self.quat_WL, (n,), "b"),
-            ("joints", self.joints, (n,), "fiu"),
+        for name, known, shape, unit in (
+            ("quat_WL", self.quat_WL, (n, 4), MAX_POSE_NORM_DEVIATION),
+            ("points", self.points, (n, 3), np.inf),
+            ("segment_cov", self.quat_WL, (n, 3, 3), np.inf),
+            ("point_cov", self.points, (n, 3, 3), np.inf),
+            ("gap", self.quat_WL, (n,), np.inf),
+            ("joints", self.joints, (n,), np.inf),
         ):
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
-                place = f"{where}{name}.{key}"
-                check_array(place, values, shape, kinds, EACH_TIME)
-                check_finite(place, values, missing=True)
-                if name == "quat_WL":
-                    check_unit(place, values, MAX_POSE_NORM_DEVIATION)
+                if name == "gap":
+                    check_array(f"{where}{name}.{key}", values, shape, "b", EACH_TIME)
+                else:
+                    check_numbers(f"{where}{name}.{key}", values, shape, EACH_TIME, missing=True, unit=unit)
         return self
 
 

@@ -7,14 +7,14 @@ what they add is in `girdle`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from ..errors import BadModel
-from .table import ROOT, BodyTable, Length
+from .table import ROOT, BodyTable
 from .tree import Tree, copy_robot, joint_placement, parse_tree
 
 UNIVERSE = "universe"  # the link of what is rigid with the root
@@ -25,8 +25,7 @@ _DECIMALS = 13  # of a vector [m] and of its change per metre of a length; what 
 
 def measure_lengths(robot: Any, table: BodyTable) -> dict[str, float]:
     """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero."""
-    at = _find_points(parse_tree(robot, robot.name), table)
-    return {name: float(np.linalg.norm(_line(at, length))) for name, length in table.lengths.items()}
+    return {name: float(np.linalg.norm(v)) for name, v in _find_lines(parse_tree(robot, robot.name), table).items()}
 
 
 def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> Any:
@@ -56,43 +55,39 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
     reached = measure_lengths(robot, table)
     for name, value in targets.items():
         if abs(reached[name] - value) > _TOLERANCE:
-            segment = table.lengths[name].segment
             raise BadModel(
-                f"{table.where}: lengths.{name}: stretching {segment} does not move its points apart by as much; name "
-                f"the segment between them"
+                f"{table.where}: lengths.{name}: stretching {table.lengths[name].segment} does not move its points "
+                f"apart by as much; name the segment between them"
             )
     return robot
 
 
-def _find_points(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
-    return {ROOT: np.zeros(3)} | {name: tree.neutral(point.link)[:3, 3] for name, point in table.points.items()}
+def _find_lines(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
+    """Length → the line (3,) [m] that it measures."""
+    at = {ROOT: np.zeros(3)} | {name: tree.neutral(point.link)[:3, 3] for name, point in table.points.items()}
 
+    def place(points: Sequence[str]) -> np.ndarray:
+        return np.asarray(np.sum([at[point] for point in points], axis=0) / len(points))
 
-def _line(at: Mapping[str, np.ndarray], length: Length) -> np.ndarray:
-    """The line (3,) [m] that a length measures."""
-    first, last = (
-        np.sum([at[point] for point in points], axis=0) / len(points) for points in (length.start, length.end)
-    )
-    return np.asarray(last - first)
+    return {name: place(length.end) - place(length.start) for name, length in table.lengths.items()}
 
 
 def _find_projections(tree: Tree, table: BodyTable) -> dict[str, dict[str, np.ndarray]]:
     """Segment → its lengths → P (3, 3): S_W = 1 + Σ (ratio − 1) P stretches the segment, all joints at zero."""
-    at = _find_points(tree, table)
-    projections: dict[str, dict[str, np.ndarray]] = {}
+    lines, projections = _find_lines(tree, table), dict[str, dict[str, np.ndarray]]()
     for segment in table.segments:
-        lines = {name: _line(at, each) for name, each in table.lengths.items() if each.segment == segment}
-        if not lines:
+        names = [name for name, length in table.lengths.items() if length.segment == segment]
+        if not names:
             continue
-        basis = np.array([line / max(np.linalg.norm(line), _LEAST) for line in lines.values()]).T  # (3, k)
-        if np.linalg.matrix_rank(basis, tol=1e-6) < len(lines):
+        basis = np.array([lines[name] / max(np.linalg.norm(lines[name]), _LEAST) for name in names]).T  # (3, k)
+        if np.linalg.matrix_rank(basis, tol=1e-6) < len(names):
             raise BadModel(
-                f"{table.where}: lengths.{', lengths.'.join(lines)}: cannot stretch segment '{segment}' independently; "
+                f"{table.where}: lengths.{', lengths.'.join(names)}: cannot stretch segment '{segment}' independently; "
                 f"up to three lengths in different directions are possible, between points in different places"
             )
         # Across the lines of one or two lengths nothing changes.
         dual = np.linalg.pinv(basis)
-        projections[segment] = {name: np.outer(basis[:, k], dual[k]) for k, name in enumerate(lines)}
+        projections[segment] = {name: np.outer(basis[:, k], dual[k]) for k, name in enumerate(names)}
     return projections
 
 
@@ -102,18 +97,12 @@ def _find_stretched(tree: Tree, table: BodyTable, segment: str) -> tuple[list[st
     These are the links from its own down to the next segments, to one of the spine also the spine below it, down to the
     next segment or the root, which keep their shape.
     """
-    starts = {name: tree.body(each.link) for name, each in table.segments.items()}
-    start = starts[segment]
-    links = tree.hanging(start, set(starts.values()))
+    start, starts = tree.body(table.segments[segment].link), {tree.body(each.link) for each in table.segments.values()}
+    links, spine = tree.hanging(start, starts), tree.path(start) if table.segments[segment].spine else []
+    spine = spine[max((k for k, joint in enumerate(spine) if joint.parent in starts), default=0) :]
+    links += [joint.parent for joint in spine[1:]]
     joints = [joint.name for link in links for joint in tree.below[link]]
-    if table.segments[segment].spine:
-        spine = tree.path(start)
-        bases = [k for k, joint in enumerate(spine) if joint.parent in set(starts.values())]
-        spine = spine[bases[-1] if bases else 0 :]
-        links += [joint.parent for joint in spine[1:]]
-        joints += [joint.name for link in (joint.parent for joint in spine[1:]) for joint in tree.below[link]]
-        joints += [spine[0].name] if spine else []
-    return links, joints
+    return links, [*joints, *(joint.name for joint in spine[:1])]
 
 
 def _stretch_link(link: Any, S: np.ndarray) -> None:

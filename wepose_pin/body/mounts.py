@@ -9,17 +9,21 @@ person's segment frames L equal W in the N-pose; in another start pose R_LS = R_
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
+import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadSession
-from ..recording import OrientationSensor, Recording, format_span
-from .start_pose import N_POSE, StartPose
+from ..errors import BadSession, one_of
+from ..recording import CONFIGURATION, OrientationSensor, Recording, format_span
+from .body import BodyModel
 from .subject import Subject
+from .table import NEUTRAL_POSE, BodyTable, Vector, load_table
+from .tree import check_joint_values, parse_tree
 
 # Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
 MAX_MOUNT_ERROR_DEG = 60.0
@@ -35,6 +39,90 @@ SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in mo
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
 
 
+# The start pose ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """The links of a body in the start pose, where the frame L' of each equals W."""
+
+    R_WK: Mapping[str, np.ndarray] = field(default_factory=dict)  # link → (3, 3); without: the frame of W
+    table: BodyTable = field(default_factory=load_table)
+    q: np.ndarray | None = None  # (nq,) the body's configuration; None: not known
+
+    def std(self, segment: str, *, again: bool = False) -> np.ndarray:
+        """Return one standard deviation (3,) [rad] about each axis of a segment's rotation off the start pose.
+
+        `again` : between two start poses of one person
+        """
+        own = self.table.segments[segment]
+        return np.array(own.repeat_std if again else own.start_std)
+
+    def rotation(self, link: str) -> np.ndarray:
+        """Return the orientation (3, 3) of a link."""
+        return self.R_WK.get(link, np.eye(3))
+
+    def turn(self, link: str, vector: Collection[float]) -> Vector:
+        """Return a vector (3,) of a link's frame, in L'."""
+        x, y, z = self.R_WK[link] @ np.array(vector) if link in self.R_WK else vector
+        return float(x), float(y), float(z)
+
+    def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
+        """Return R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
+        return Rotation.from_matrix(self.R_WK[segment]) * R_LS if segment in self.R_WK else R_LS
+
+    def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
+        """Return the mount R_LS of a sensor whose orientation in the start pose is R_WS."""
+        return Rotation.from_matrix(self.R_WK[segment]).inv() * R_WS if segment in self.R_WK else R_WS
+
+
+N_POSE = StartPose()
+
+
+def find_start_pose(body: BodyModel, recording: Recording) -> StartPose:
+    """Find the links of a body in the start pose of its recording."""
+    q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
+    # A person's segment frames equal W in the N-pose, whatever the pose of a body whose joints are at zero.
+    is_neutral = recording.start_pose == NEUTRAL_POSE and not body.table.is_mechanism
+    return StartPose({} if is_neutral else body.orient_links(q), body.table, q)
+
+
+def compute_start_configuration(
+    model: BodyModel, start_pose: str, joints: Mapping[str, float], where: str
+) -> np.ndarray:
+    """Compute `q` (nq,) in the start pose.
+
+    Parameters
+    ----------
+    start_pose : a pose of the body's table, or "configuration"
+    joints : joint of the URDF → value [rad or m] in a configuration; those not named are at zero
+    where : begins an error's text
+
+    Raises
+    ------
+    BadSession
+        A start pose that the table does not have; a joint that the body does not have, or outside its limits.
+    """
+    poses = {**model.table.poses, CONFIGURATION: joints}
+    if start_pose not in poses:
+        raise BadSession(f"{where}: start_pose = '{start_pose}' is not known; {one_of(poses, start_pose)}")
+    values, m = poses[start_pose], model.pin
+    check_joint_values(model.robot, values, f"{where}: joints", BadSession)
+    q, tree = pin.neutral(m), parse_tree(model.robot, where)
+    for joint in range(1, m.njoints):
+        if m.nqs[joint] == 1:
+            q[m.idx_qs[joint]] = values.get(m.names[joint], 0.0)
+    for link, axes in model.axes.items():  # three joints that are one spherical joint
+        angles = np.array([[values.get(joint.name, 0.0)] for joint in tree.path(link)[-3:]])
+        first, second, third = Rotation.from_rotvec(angles * axes)
+        at = m.idx_qs[model.joints[link]]
+        q[at : at + 4] = (first * second * third).as_quat()
+    return q
+
+
+# Mounts before alignment, and their covariance ----------------------------------------------------------------------
+
+
 def collect_nominal_mounts(
     recording: Recording, subject: Subject | None, start_pose: StartPose
 ) -> dict[str, np.ndarray]:
@@ -48,22 +136,66 @@ def collect_nominal_mounts(
     nominal = {segment: find_nominal_mount(recording, segment, subject, start_pose) for segment in recording.sensors}
     missing = [segment for segment, mount in nominal.items() if mount is None]
     if missing:
-        remounted = subject is not None and recording.remounted and set(missing) & set(subject.mounts)
-        reason = " (remounted = true: the subject's are of another mounting)" if remounted else ""
-        if subject is not None and subject.mounts and not remounted:
-            reason = f"; the subject '{subject.name}' has none for it"
         others = f", nor that of {', '.join(missing[1:])}" if len(missing) > 1 else ""
-        # Calibrations close chains of lengths: a segment on which no length lies is in none of them.
-        measured = {length.segment for length in start_pose.table.lengths.values()}
-        unfound = [segment for segment in missing if segment not in measured]
+        if subject is not None and recording.remounted and set(missing) & set(subject.mounts):
+            others += " (remounted = true: the subject's are of another mounting)"
+        # Calibrations close chains of lengths: they find no mount of a segment on which no length lies.
+        can_calibrate = {length.segment for length in start_pose.table.lengths.values()} & set(missing)
         remedy = "; or find it by `wepose calibrate` (without joined hands --protocol free), then track with --subject"
-        remedy = remedy if len(unfound) < len(missing) else ""
-        remedy += f"; no calibration finds that of {', '.join(unfound)}" if unfound else ""
         raise BadSession(
-            f"{recording.where()}: sensors.{missing[0]}.mount is not known{others}{reason}: state it, as in "
-            f'mount = {{ up = "+x", forward = "-z" }}{remedy}'
+            f"{recording.where()}: sensors.{missing[0]}.mount is not known{others}: state it, as in "
+            f'mount = {{ up = "+x", forward = "-z" }}{remedy if can_calibrate else ""}'
         )
     return {segment: mount for segment, mount in nominal.items() if mount is not None}
+
+
+def find_nominal_mount(
+    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose = N_POSE
+) -> np.ndarray | None:
+    """Find the mount `quat_LS` (4,) xyzw: the calibrated one, else the stated one; None: unknown.
+
+    A stated mount names the sensor's axes that point up and forward in the start pose. Where a device measures the
+    orientation of the segment itself, and no mount is stated, it is the identity.
+    """
+    if subject is not None and segment in subject.mounts and not recording.remounted:
+        return subject.mounts[segment]
+    sensor = recording.sensors[segment]
+    stated = sensor.stated_quat_LS
+    if stated is None:
+        is_own = isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted)
+        return np.array([0.0, 0.0, 0.0, 1.0]) if is_own else None
+    return start_pose.to_segment(segment, Rotation.from_quat(stated)).as_quat() if start_pose.R_WK else stated
+
+
+def find_mount_covariance(
+    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose = N_POSE
+) -> np.ndarray | None:
+    """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L', in the N-pose L; None: not known."""
+    cov = None if subject is None or recording.remounted else subject.mount_covariance(segment)
+    R = start_pose.R_WK.get(segment)
+    return cov if cov is None or R is None else R @ cov @ R.T
+
+
+def compute_start_heading_var(
+    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
+) -> float:
+    """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
+
+    It is zero for the segment whose heading defines x. A calibrated mount contains the heading error of the
+    calibration's start pose, so that only the variance between two start poses of one person is left.
+    """
+    if segment == start_pose.table.reference:
+        return 0.0
+    is_calibrated = find_mount_covariance(recording, segment, subject) is not None
+    return float(start_pose.std(segment, again=is_calibrated)[2] ** 2)
+
+
+# Alignment ---------------------------------------------------------------------------------------------------------
+
+
+def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
+    """Return ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
+    return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
 def align_sensors(
@@ -97,31 +229,30 @@ def align_sensors(
         R_WL_start = start_pose.to_world(aligned[0], Rotation.identity())
         aligned_heading_offset = compute_heading_offset(R_VS_start[aligned[0]], R_WL_start)
     for segment, R_VS in R_VS_start.items():
-        if recording.sensors[segment].aligned:
+        if segment in aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
         R_WS_nominal = start_pose.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
         psi = compute_heading_offset(R_VS, R_WS_nominal)
         R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS
-        tilt_error_deg = np.degrees((R_WS_start * R_WS_nominal.inv()).magnitude())
-        if tilt_error_deg > MAX_MOUNT_ERROR_DEG:
-            raise BadSession(_describe_mount_error(recording, segment, subject, tilt_error_deg, start))
-        if tilt_error_deg > MOUNT_WARNING_DEG:
-            value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
-            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit))
-        mount_cov = find_start_mount_covariance(recording, segment, subject, start_pose)
-        if mount_cov is not None:
+        tilt_error = float((R_WS_start * R_WS_nominal.inv()).magnitude())
+        if tilt_error > np.deg2rad(MAX_MOUNT_ERROR_DEG):
+            raise BadSession(_describe_mount_error(recording, segment, subject, np.degrees(tilt_error), start))
+        if tilt_error > np.deg2rad(MOUNT_WARNING_DEG):
+            limit = float(np.deg2rad(MOUNT_WARNING_DEG))
+            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit))
+        mount_cov = find_mount_covariance(recording, segment, subject, start_pose)
+        if mount_cov is not None and subject is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
             misfit = (R_WS_start * R_WS_nominal.inv()).as_rotvec()[:2]
             misfit_cov = mount_cov[:2, :2] + np.diag(start_pose.std(segment)[:2] ** 2)
             R_WS_start = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_WS_nominal
             psi = compute_heading_offset(R_VS, R_WS_start)
-            calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
-            if calibrated_offset is not None:
+            if segment in subject.start_pose_offset:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
-                misfit = misfit - calibrated_offset.tilt
-                misfit_cov = np.diag(start_pose.repeat_std(segment)[:2] ** 2)
+                misfit = misfit - subject.start_pose_offset[segment].tilt
+                misfit_cov = np.diag(start_pose.std(segment, again=True)[:2] ** 2)
             squared_stds = float(misfit @ np.linalg.solve(misfit_cov, misfit))
             if squared_stds > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
@@ -135,7 +266,6 @@ def align_sensors(
 def _describe_mount_error(
     recording: Recording, segment: str, subject: Subject | None, tilt_error_deg: float, start: tuple[float, float]
 ) -> str:
-    """Return the text of the error that gravity contradicts a mount in the start pose, and what to do."""
     if subject is not None and segment in subject.mounts and not recording.remounted:
         name, remedy = ": its calibrated mount", "if the sensor was mounted again, state remounted = true and its mount"
     else:
@@ -146,58 +276,3 @@ def _describe_mount_error(
         f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start pose "
         f"({format_span(start)}); {remedy}"
     )
-
-
-def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
-    """Return ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
-    return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
-
-
-def find_nominal_mount(
-    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose = N_POSE
-) -> np.ndarray | None:
-    """Find the mount `quat_LS` (4,) xyzw: the calibrated one, else the stated one; None: unknown.
-
-    A stated mount names the sensor's axes that point up and forward in the start pose. Where a device measures the
-    orientation of the segment itself, and no mount is stated, it is the identity.
-    """
-    if subject is not None and segment in subject.mounts and not recording.remounted:
-        return subject.mounts[segment]
-    sensor = recording.sensors[segment]
-    stated = sensor.stated_quat_LS
-    if stated is None and isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted):
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    if stated is None or segment not in start_pose.R_WK:
-        return stated
-    return start_pose.to_segment(segment, Rotation.from_quat(stated)).as_quat()
-
-
-def compute_start_heading_var(
-    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
-) -> float:
-    """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
-
-    It is zero for the segment whose heading defines x. A calibrated mount contains the heading error of the
-    calibration's start pose, so that only the variance between two start poses of one person is left.
-    """
-    if segment == start_pose.table.reference:
-        return 0.0
-    calibrated = find_mount_covariance(recording, segment, subject) is not None
-    std = start_pose.repeat_std(segment) if calibrated else start_pose.std(segment)
-    return float(std[2] ** 2)
-
-
-def find_mount_covariance(recording: Recording, segment: str, subject: Subject | None) -> np.ndarray | None:
-    """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L; None: not known for this mounting."""
-    return None if subject is None or recording.remounted else subject.mount_covariance(segment)
-
-
-def find_start_mount_covariance(
-    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
-) -> np.ndarray | None:
-    """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L'; None: as `find_mount_covariance`."""
-    cov = find_mount_covariance(recording, segment, subject)
-    if cov is None or segment not in start_pose.R_WK:
-        return cov
-    R = start_pose.R_WK[segment]
-    return R @ cov @ R.T

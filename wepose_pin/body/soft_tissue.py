@@ -21,22 +21,13 @@ SCATTER_LOG_STD = 0.5
 
 
 class TissueMean(NamedTuple):
-    """What a segment has turned beyond its sensor, in the mean of one person; about the segment's axes.
+    """What a segment has turned beyond its sensor, in the mean of one person; about the segment's axes."""
 
-    Parameters
-    ----------
-    share : of the means that the table states for tilt and raised arms
-    lag : [rad/rad] per angle of twist that the sensor shows
-    start : [rad] about z in the start pose
-    start_std : [rad] one standard deviation of `start`
-    scatter : size of what varies beyond the means, as a share of that among all people
-    """
-
-    share: float
-    lag: float
-    start: float = 0.0
-    start_std: float = 0.0
-    scatter: float = 1.0
+    share: float  # of the means that the table states for tilt and raised arms
+    lag: float  # [rad/rad] per angle of twist that the sensor shows
+    start: float = 0.0  # [rad] about z in the start pose
+    start_std: float = 0.0  # [rad] one standard deviation of `start`
+    scatter: float = 1.0  # size of what varies beyond the means, as a share of that among all people
 
 
 def estimate_scatter(hinge_stds: Collection[float]) -> float:

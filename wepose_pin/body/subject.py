@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import NonNegative, check_arguments, check_array, check_fields, check_finite, check_names, check_unit
+from ..arguments import NonNegative, check_arguments, check_fields, check_names, check_numbers
 from ..diagnostics import notebook_html
 from ..documents import (
     Key,
@@ -30,12 +30,10 @@ from .anthropometry import compute_population_lengths
 from .body import BodyModel
 from .girdle import PARAMETERS
 from .soft_tissue import TissueMean, estimate_scatter
-from .table import BodyTable
-from .table_file import load_table
+from .table import BodyTable, load_table
 
-_ROW = re.compile(
-    r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law"
-)  # of a covariance, other than lengths
+# A row of a covariance, other than lengths.
+_ROW = re.compile(r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law")
 LONGEST = 3.0  # [m] of a plausible length
 FORMAT = 2
 Quality = Literal["pass", "poor", "fail"]  # of a calibration
@@ -133,8 +131,10 @@ class Subject:
 
     def lengths_html(self) -> str:
         """Return the lengths with their standard deviations as a table for a notebook."""
-        cells = {name: f"{1e3 * length:.0f} ± {1e3 * self.std(name):.0f} mm" for name, length in self.lengths.items()}
-        rows = (f"<tr><td>{escape(name)}</td><td>{cell}</td></tr>" for name, cell in cells.items())
+        rows = (
+            f"<tr><td>{escape(name)}</td><td>{1e3 * length:.0f} ± {1e3 * self.std(name):.0f} mm</td></tr>"
+            for name, length in self.lengths.items()
+        )
         return f"<table>{''.join(rows)}</table>"
 
     def save(self, path: str | Path, force: bool = False) -> Path:
@@ -184,21 +184,20 @@ class Subject:
         """
         where = where or f"subject {self.name!r}: "
         check_fields(self, where)
-        arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
-        arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
-        arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
-        arrays += [(f"girdles.{point}", values, (len(PARAMETERS),)) for point, values in self.girdles.items()]
+        arrays: dict[str, tuple[Any, int]] = {f"mounts.{name}": (quat, 4) for name, quat in self.mounts.items()}
+        arrays |= {f"hinges.{name}.axis": (hinge.axis, 3) for name, hinge in self.hinges.items()}
+        arrays |= {f"start_pose_offset.{name}.tilt": (each.tilt, 2) for name, each in self.start_pose_offset.items()}
+        arrays |= {f"girdles.{name}": (values, len(PARAMETERS)) for name, values in self.girdles.items()}
         try:
             check_lengths(f"{where}lengths", self.lengths)
             named = [row for row in self.order if not _ROW.fullmatch(row)]
             check_names(f"{where}covariance.order", named, self.lengths)
             if len(set(self.order)) < len(self.order):
                 raise BadData(f"{where}covariance.order = {self.order}: each name once")
-            for name, values, shape in [*arrays, ("covariance", self.covariance, (len(self.order),) * 2)]:
-                check_array(f"{where}{name}", values, shape)
-                check_finite(f"{where}{name}", values)
-                if name.startswith(("mounts", "hinges")):
-                    check_unit(f"{where}{name}", values, 1e-3)
+            check_numbers(f"{where}covariance", self.covariance, (len(self.order),) * 2)
+            for name, (values, size) in arrays.items():
+                unit = 1e-3 if name.startswith(("mounts", "hinges")) else np.inf
+                check_numbers(f"{where}{name}", values, (size,), unit=unit)
         except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
         return self
@@ -226,10 +225,7 @@ class Subject:
             raise BadSubject(str(error)) from None
 
     def shape(self, body: BodyModel, *, remounted: bool = False) -> BodyModel:
-        """Return the body with this person's lengths, shoulder girdles and means of soft tissue.
-
-        Of `remounted` sensors the means are not known.
-        """
+        """Return the body with this person's lengths, girdles and means of soft tissue, unknown if `remounted`."""
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
         girdles = {name: own for name, own in self.girdles.items() if name in body.table.girdles}
         return replace(body, girdles=girdles, tissue_means={} if remounted else self._find_tissue_means(body))
@@ -418,11 +414,10 @@ def population_subject(
 
 def subject_toml(subject: Subject) -> str:
     """Return the text of ``subject.toml``."""
-    covariances = {segment: subject.mount_covariance(segment) for segment in subject.mounts}
     stds = {
         f"mounts.{toml_key(segment)}": [f"std_deg = {np.degrees(np.sqrt(np.trace(cov) / 3.0)):.3f}"]
-        for segment, cov in covariances.items()
-        if cov is not None
+        for segment in subject.mounts
+        if (cov := subject.mount_covariance(segment)) is not None
     }
     lines = [f"format = {FORMAT}", *format_record(subject, stds)]
     if subject.order:
@@ -478,33 +473,29 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     """Return the subject of the parsed file."""
     top = TomlTable(values, str(path), error=BadSubject)
     if values.get("format") != FORMAT:
-        raise BadSubject(
-            f"{path}: format = {values.get('format')!r}; a subject, as `wepose calibrate` writes one, has "
-            f"format = {FORMAT}"
-        )
+        has = f"format = {values.get('format')!r}"
+        raise BadSubject(f"{path}: {has}; a subject, as `wepose calibrate` writes one, has format = {FORMAT}")
     if "lengths" not in top:
         raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
     base = Subject(path.parent.name, {}, (), np.zeros((0, 0)))
     subject = read_record(Subject, top, base=base, others=("format", "lengths_std", "covariance"))
-    order, covariance = _read_covariance(top, subject.lengths)
+    table, std = top.table("covariance", {}), top.table("lengths_std", {})
+    table.allow("order", "matrix")
+    std.allow(*subject.lengths)
+    if table.values:
+        order = table.texts("order")
+        try:
+            covariance = np.array(table.values.get("matrix"), dtype=float)
+        except (TypeError, ValueError, OverflowError):
+            raise BadSubject(f"{table.at('matrix')}: rows of numbers are needed, of one length") from None
+    else:
+        order = tuple(name for name in subject.lengths if name in std)
+        covariance = np.diag([(std.number(name, 0.0) or 0.0) ** 2 for name in order])
     subject = replace(subject, order=order, covariance=covariance).check(f"{path}: ")
     # What the digits of the file leave of a unit vector's length.
-    mounts = {name: quat / np.linalg.norm(quat) for name, quat in subject.mounts.items()}
-    hinges = {
-        name: hinge._replace(axis=hinge.axis / np.linalg.norm(hinge.axis)) for name, hinge in subject.hinges.items()
-    }
-    return replace(subject, mounts=mounts, hinges=hinges)
-
-
-def _read_covariance(top: TomlTable, lengths: Collection[str]) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the names of the rows, and the matrix; without [covariance] that of the standard deviations of lengths."""
-    table, std = top.table("covariance", {}), top.table("lengths_std", {})
-    std.allow(*lengths)
-    if not table.values:
-        variances = {name: (std.number(name, None) or 0.0) ** 2 for name in lengths if name in std}
-        return tuple(variances), np.diag(list(variances.values()))
-    table.allow("order", "matrix")
-    try:
-        return table.texts("order"), np.array(table.values.get("matrix"), dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise BadSubject(f"{table.at('matrix')}: rows of numbers are needed, of one length") from None
+    units = {name: hinge.axis / np.linalg.norm(hinge.axis) for name, hinge in subject.hinges.items()}
+    return replace(
+        subject,
+        mounts={name: quat / np.linalg.norm(quat) for name, quat in subject.mounts.items()},
+        hinges={name: hinge._replace(axis=units[name]) for name, hinge in subject.hinges.items()},
+    )

@@ -1,20 +1,24 @@
-"""The table of a body: names and properties of its segments, points and lengths; `table_file` reads and writes it.
+"""The table of a body: names and properties of its segments, points and lengths, and its file (docs/models.md).
 
-Outside simulation and joint angles no module names a segment, a point or a length. docs/models.md explains the file.
+Outside simulation and joint angles no module names a segment, a point or a length.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Annotated, Literal, NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..documents import Key
+from ..assets import asset
+from ..documents import Key, TomlTable, format_record, read_record, read_toml
+from ..errors import BadModel, one_of
+from ..recording.sensors import AXES, read_axes
 from .girdle import Direction, Girdle, SegmentName
 
 DEFAULT_BODY = "upper_body"
@@ -33,26 +37,18 @@ Angles = Annotated[Vector, Key(unit="deg", least=0.0)]
 class SoftTissue(NamedTuple):
     """How far soft tissue rotates a sensor on its segment in motion; standard deviations about x, y, z of the segment.
 
-    Its parts are independent, so that their squares add up.
-
-    Parameters
-    ----------
-    std : (3,) [rad] in any pose
-    relative_to : the segment against which tilt and twist are measured; empty: W
-    per_tilt : (3,) [rad/rad] per angle by which the segment's long axis is tilted since the start pose
-    per_twist : [rad/rad] about the long axis, per angle by which the segment is rotated about it since the start pose
-    raised : segments on which it depends too, such as the arms for a sensor on the torso
-    per_raised : (3,) [rad/rad] per mean angle of their long axes off hanging
-    mean_per_tilt, mean_per_twist, mean_per_raised : by how much the segment has turned beyond its sensor in the mean of
-        people; the standard deviations contain it
+    Its parts are independent, so that their squares add up; they contain the means, by which the segment has turned
+    beyond its sensor in the mean of people.
     """
 
-    std: Angles = ZERO
-    relative_to: str = ""
-    per_tilt: Annotated[Vector, Key(least=0.0)] = ZERO
-    per_twist: float = 0.0
-    raised: tuple[str, ...] = ()
-    per_raised: Annotated[Vector, Key(least=0.0, omit_zero=True)] = ZERO
+    std: Angles = ZERO  # [rad] in any pose
+    relative_to: str = ""  # the segment against which tilt and twist are measured; empty: W
+    per_tilt: Annotated[Vector, Key(least=0.0)] = ZERO  # [rad/rad] per tilt of the long axis since the start pose
+    per_twist: float = 0.0  # [rad/rad] about the long axis, per rotation of the segment about it since the start pose
+    raised: tuple[str, ...] = ()  # segments on which it depends too, such as the arms for a sensor on the torso
+    per_raised: Annotated[Vector, Key(least=0.0, omit_zero=True)] = (
+        ZERO  # [rad/rad] per mean angle of these off hanging
+    )
     mean_per_tilt: Annotated[Vector, Key(omit_zero=True)] = ZERO
     mean_per_twist: float = 0.0
     mean_per_raised: Annotated[Vector, Key(omit_zero=True)] = ZERO
@@ -65,37 +61,28 @@ def _same(degrees: float) -> tuple[float, float, float]:
 
 
 class Segment(NamedTuple):
-    """A segment of a body.
+    """A segment of a body; standard deviations are about its axes."""
 
-    Parameters
-    ----------
-    link : its link in the URDF
-    up, forward : the link's axes that point up and forward in the N-pose; None: found with all joints at zero
-    along : (3,) unit, its long axis in its own frame, away from the joint to the segment above
-    spine : its rotation is shared by all joints between it and the root
-    rigid_without_sensor : without a sensor it is rigid with the segment above; False: it is unknown then
-    labels : a regular expression of words that mean it in a sensor's name
-    joint : the name of the joint to the segment above, where no point names it
-    foam_std : (3,) [rad/rad] by which a foam under its sensor gives, about its axes, per rotation of the segment
-    soft_tissue : how far soft tissue rotates its sensor
-    start_mean : (3,) [rad] mean rotation vector, in its axes, of people off the neutral pose
-    start_std : (3,) [rad] about its axes, one standard deviation of its rotation off the start pose among people
-    repeat_std : (3,) [rad] the same between two start poses of one person
-    """
-
-    link: str
+    link: str  # in the URDF
+    # The link's axes that point up and forward in the N-pose; None: found with all joints at zero.
     up: Annotated[str | None, Key(of="axes")] = None
     forward: Annotated[str | None, Key(of="axes")] = None
-    along: Direction = (0.0, 0.0, -1.0)
-    spine: bool = False
+    along: Direction = (
+        0.0,
+        0.0,
+        -1.0,
+    )  # unit, its long axis in its own frame, away from the joint to the segment above
+    spine: bool = False  # its rotation is shared by all joints between it and the root
+    # Without a sensor it is rigid with the segment above; False: it is unknown then.
     rigid_without_sensor: Annotated[bool, Key("without_sensor", words={"rigid": True, "unknown": False})] = False
-    labels: str = ""
-    joint: str = ""
+    labels: str = ""  # a regular expression of words that mean it in a sensor's name
+    joint: str = ""  # name of the joint to the segment above, where no point names it
+    # [rad/rad] by which a foam under its sensor gives, per rotation of the segment.
     foam_std: Annotated[Vector, Key("foam_deg", "deg", least=0.0, omit_zero=True)] = ZERO
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
-    start_mean: Annotated[Vector, Key(unit="deg")] = ZERO
-    start_std: Angles = _same(4.0)
-    repeat_std: Angles = _same(2.0)
+    start_mean: Annotated[Vector, Key(unit="deg")] = ZERO  # [rad] mean rotation vector of people off the neutral pose
+    start_std: Angles = _same(4.0)  # [rad] of its rotation off the start pose among people
+    repeat_std: Angles = _same(2.0)  # [rad] the same between two start poses of one person
 
     @classmethod
     def of_mechanism(cls, link: str, *, rigid: bool) -> Segment:
@@ -113,46 +100,27 @@ class Point(NamedTuple):
 
 
 class Length(NamedTuple):
-    """A length of a body, which scales a segment along the line between two places.
-
-    Parameters
-    ----------
-    segment : what it scales
-    start, end : a point, or two in whose middle the line begins or ends, with all joints at zero
-    share : its name among the ratios to stature in ``calibration/anthropometry.toml``; empty: it has none, and the
-        prior is the model's own value
-    std_percent : one standard deviation of the model's own value, as a share of it [%]
-    """
+    """A length of a body, which scales a segment along the line between two places, all joints at zero."""
 
     segment: SegmentName
-    start: Annotated[tuple[str, ...], Key("from", of="points")]
+    start: Annotated[tuple[str, ...], Key("from", of="points")]  # a point, or two in whose middle the line begins
     end: Annotated[tuple[str, ...], Key("to", of="points")]
-    share: str = ""
-    std_percent: Annotated[float, Key(least=1e-3)] = 10.0
+    share: str = ""  # its name among the ratios to stature in calibration/anthropometry.toml; empty: the model's value
+    std_percent: Annotated[float, Key(least=1e-3)] = 10.0  # of the model's value [%]
 
 
 class HingeJoint(NamedTuple):
-    """A joint of nearly one axis; standard deviations [rad].
-
-    Parameters
-    ----------
-    on, moves : segments; the long axis of `moves` stays in the plane of `on` that is normal to the axis
-    axis : (3,) unit, in the frame of `on`
-    range : [rad] least and largest rotation of `moves` about the axis
-    softness : of the angle between the long axis and the plane
-    common_std, mirror_std : of the axis's rotation about the long axis of `on`, the part that is equal and the part
-        that is opposite on both sides of the body
-    tilt_std : of the axis's rotation about the direction across both, the long axis and itself
-    """
+    """A joint of nearly one axis; standard deviations [rad]."""
 
     on: SegmentName
-    moves: SegmentName
-    axis: Vector
-    range: Annotated[tuple[float, float], Key(unit="deg")] = (-np.pi, np.pi)
-    softness: Angle = float(np.deg2rad(2.0))
+    moves: SegmentName  # its long axis stays in the plane of `on` that is normal to the axis
+    axis: Vector  # unit, in the frame of `on`
+    range: Annotated[tuple[float, float], Key(unit="deg")] = (-np.pi, np.pi)  # [rad] of `moves` about the axis
+    softness: Angle = float(np.deg2rad(2.0))  # of the angle between the long axis and the plane
+    # Of the axis's rotation about the long axis of `on`: the part that is equal, and opposite, on both sides.
     common_std: Angle = float(np.deg2rad(6.5))
     mirror_std: Angle = float(np.deg2rad(20.0))
-    tilt_std: Angle = float(np.deg2rad(5.0))
+    tilt_std: Angle = float(np.deg2rad(5.0))  # of the axis's rotation about the direction across both
 
 
 class Place(NamedTuple):
@@ -169,20 +137,12 @@ class Drawing(NamedTuple):
 
 
 class Limb(NamedTuple):
-    """An arm, a leg or another line of points from the body to a tip.
+    """An arm, a leg or another line of points from the body to a tip."""
 
-    Parameters
-    ----------
-    points : from the one on the body to the tip
-    segments : between these points, in that order; only those that have a length
-    base : the segment of the body to which it belongs; None: the root
-    origin : its first point, with that of the other side where there is one, left before right; distances of the tip
-        are from their middle
-    """
-
-    points: tuple[str, ...]
-    segments: tuple[str, ...]
-    base: str | None
+    points: tuple[str, ...]  # from the one on the body to the tip
+    segments: tuple[str, ...]  # between these points, in that order; only those that have a length
+    base: str | None  # the segment of the body to which it belongs; None: the root
+    # Its first point, with that of the other side where there is one, left first: distances are from their middle.
     origin: tuple[str, ...]
 
     @property
@@ -192,44 +152,28 @@ class Limb(NamedTuple):
 
 @dataclass(frozen=True)
 class BodyTable:
-    """The names and properties of what a body has: the content of its file.
+    """The names and properties of what a body has: the content of its file, whose keys docs/body-tables.md explains."""
 
-    Parameters
-    ----------
-    name : of the body, for messages and files
-    segments : name → segment; the first one faces x of W in the start pose
-    urdf : the file beside the table; empty: that of the table's name
-    kind : "person": three revolute joints in a row are one spherical joint, segment frames equal W in the N-pose;
-        "mechanism": joints and frames are those of the URDF
-    up, forward : the root link's axes that point up and forward while all joints are at zero
-    root : the link whose origin is that of W, or links midway between which it is; empty: the root link
-    points : name → its link, and its place in it
-    lengths : name → what it scales
-    hinges : name → joint of nearly one axis
-    girdles : shoulder point → the law by which it moves on the trunk as the arm is raised
-    poses : name → joint of the URDF → value [rad or m]
-    pairs : name on the left → name on the right, of segments, points, lengths and hinges
-    sensors : segment → where its sensor usually sits
-    draw : its lines and paths
-    where : the table's file, for messages
-    """
-
-    name: Annotated[str, None]
-    segments: Mapping[str, Segment]
-    urdf: str = ""
+    name: Annotated[str, None]  # for messages and files
+    segments: Mapping[str, Segment]  # the first one faces x of W in the start pose
+    urdf: str = ""  # the file beside the table
+    # A person's three revolute joints in a row are one spherical joint, and segment frames equal W in the N-pose; a
+    # mechanism's joints and frames are those of the URDF.
     kind: Literal["person", "mechanism"] = "person"
-    up: Annotated[str, Key(of="axes")] = "+z"
+    up: Annotated[str, Key(of="axes")] = "+z"  # the root link's axes that point up and forward, all joints at zero
     forward: Annotated[str, Key(of="axes")] = "+x"
-    root: tuple[str, ...] = ()
+    root: tuple[str, ...] = ()  # the link whose origin is that of W, or links midway between which it is
     points: Mapping[str, Point] = field(default_factory=dict)
     lengths: Mapping[str, Length] = field(default_factory=dict)
     hinges: Mapping[str, HingeJoint] = field(default_factory=dict)
-    girdles: Mapping[str, Girdle] = field(default_factory=dict)
-    poses: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: {NEUTRAL_POSE: {}})
-    pairs: Annotated[Mapping[str, str], Key(of="names")] = field(default_factory=dict)
+    girdles: Mapping[str, Girdle] = field(default_factory=dict)  # shoulder point → how it moves on the trunk
+    poses: Mapping[str, Mapping[str, float]] = field(
+        default_factory=dict
+    )  # name → joint of the URDF → value [rad or m]
+    pairs: Annotated[Mapping[str, str], Key(of="names")] = field(default_factory=dict)  # left → right
     sensors: Mapping[str, Place] = field(default_factory=dict)
     draw: Drawing = field(default_factory=Drawing)
-    where: Annotated[str, None] = "segments"
+    where: Annotated[str, None] = "segments"  # the table's file, for messages
 
     @property
     def is_mechanism(self) -> bool:
@@ -263,9 +207,7 @@ class BodyTable:
         return "_".join(word for word in name.split("_") if word in other)
 
     def joint_name(self, segment: str) -> str:
-        """Return the name of the joint to the segment above: `Segment.joint`, else the point at which the segment
-        begins, else the segment's name.
-        """
+        """Return the name of the joint to the segment above: as stated, or the point at which it begins, or its own."""
         ends = self.ends(segment)
         beginning = ends[0] if ends else ()
         return self.segments[segment].joint or (beginning[0] if len(beginning) == 1 else segment)
@@ -289,9 +231,8 @@ class BodyTable:
         own = dict.fromkeys(between[ends] for ends in pairwise(points) if ends in between)
         above = (segment for ends, segment in between.items() if points[0] in ends and segment not in own)
         origin = [point for point in (points[0], self.counterpart(points[0])) if point is not None]
-        return Limb(
-            points, tuple(own), next(above, None), tuple(sorted(origin, key=lambda name: name not in self.pairs))
-        )
+        origin = sorted(origin, key=lambda name: name not in self.pairs)
+        return Limb(points, tuple(own), next(above, None), tuple(origin))
 
     @property
     def drawn_limbs(self) -> dict[str, Limb]:
@@ -355,3 +296,142 @@ def prune_table(table: BodyTable) -> BodyTable:
             tuple(point for point in table.draw.paths if point in points),
         ),
     )
+
+
+# The file ------------------------------------------------------------------------------------------------------------
+
+
+MODEL_TABLE = "model.toml"
+
+
+@lru_cache(maxsize=8)
+def load_table(name: str = DEFAULT_BODY) -> BodyTable:
+    """Return the table of a body that comes with the package."""
+    if name not in _list_bodies():
+        raise BadModel(f"no body '{name}' comes with the package; {one_of(_list_bodies(), name)}")
+    return read_table(asset("urdf", f"{name}.toml"))
+
+
+def _list_bodies() -> list[str]:
+    """Return the names of the bodies that come with the package."""
+    return sorted(path.stem for path in asset("urdf", f"{DEFAULT_BODY}.toml").parent.glob("*.toml"))
+
+
+def check_segments(table: BodyTable, names: Iterable[str], where: str, error: type[Exception]) -> None:
+    """Raise an `error` whose text begins with `where` if a name is no segment of a body."""
+    for name in names:
+        if name not in table.segments:
+            others = [body for body in _list_bodies() if name in load_table(body).segments]
+            known = f"the body {others[0]} has it" if others else one_of(table.segments, name)
+            if others and where.endswith("sensors."):
+                known += f"; to do without that sensor, write ignore = true in [sensors.{name}]"
+            raise error(f"{where}{name} is no segment of {table.name}; {known}")
+
+
+def read_table(path: Path) -> BodyTable:
+    """Read a table from a TOML file.
+
+    With the key ``like`` it is the table of another body, except for what the file states. It then has the segments
+    that the file names, or all of the other body where it names none of them.
+    """
+    top = TomlTable(read_toml(path, "the table of a body", BadModel), str(path), error=BadModel)
+    own = {key: top.table(key, {}) for key in ("segments", "points", "lengths", "hinges")}
+    like = load_table(top.choice("like", _list_bodies())) if "like" in top else BodyTable("", {})
+    kind: Any = top.choice("kind", KINDS, like.kind)
+    new = Segment.of_mechanism("", rigid=False) if kind == KINDS[1] else Segment("")
+    segments = {
+        name: like.segments.get(name, new)._replace(link=name, up=None, forward=None) for name in own["segments"].values
+    }
+    whole = not set(segments) & set(like.segments)  # the same body with more on it
+    segments = {**like.segments, **segments} if whole else segments
+    begin = {segment.link: name for name, segment in like.segments.items() if name in segments}
+    # A point at which a segment begins is there with the segment.
+    points = {name: at for name, at in like.points.items() if whole or (at.link in begin and not any(at.at))}
+    points |= {name: Point(name) for name in own["points"].values}
+    poses = {NEUTRAL_POSE: dict[str, float]()}
+    base = BodyTable(path.stem, segments, kind=kind, points=points, poses=poses, where=str(path))
+    names = ("lengths", "hinges", "girdles", "pairs", "sensors", "draw")
+    base = prune_table(replace(base, **{name: getattr(like, name) for name in names}))
+
+    known = {key: {**getattr(base, key), **table.values} for key, table in own.items()}
+    known |= {
+        "names": {name: None for each in known.values() for name in each},
+        "points": {**known["points"], ROOT: None},
+    }
+    table = read_record(BodyTable, top, {**known, "axes": AXES}, base, others=("like",))
+    if not table.segments:
+        raise BadModel(f'{top.at("segments")} is missing; each segment\'s link is needed, as in torso = "chest_link"')
+    points = dict(table.points)
+    for name, point in base.points.items():
+        if name not in own["points"].values and point.link in begin:
+            points[name] = Point(table.segments[begin[point.link]].link, point.at)
+    table = replace(
+        table,
+        urdf=table.urdf or path.with_suffix(".urdf").name,
+        segments={name: table.segments[name] for name in (*like.segments, *table.segments) if name in table.segments},
+        points={name: points[name] for name in (*like.points, *points) if name in points},
+        hinges={name: _check_hinge(f"{top.at('hinges')}.{name}", hinge) for name, hinge in table.hinges.items()},
+    )
+    _check_table(table, top)
+    return table
+
+
+def _check_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
+    """Return the hinge with an axis of unit length."""
+    size = float(np.linalg.norm(hinge.axis))
+    if size < 1e-6 or hinge.range[0] >= hinge.range[1] or hinge.on == hinge.moves:
+        raise BadModel(f"{place}: two segments, an axis of some length and a range from the least on are needed")
+    x, y, z = (v / size for v in hinge.axis)
+    return hinge._replace(axis=(x, y, z))
+
+
+def _check_table(table: BodyTable, top: TomlTable) -> None:
+    """Raise `BadModel` on names that the table does not know, parallel axes, and labels that are no expression."""
+    names = (*table.segments, *table.points, *table.lengths, *table.hinges)
+    drawn = [*(point for limb in table.draw.limbs for point in limb), *table.draw.paths]
+    for key, used, known in (
+        ("girdles", table.girdles, table.points),
+        ("sensors", table.sensors, table.segments),
+        ("pairs", table.pairs, names),
+        ("draw", drawn, table.points),
+    ):
+        for name in used:
+            if name not in known:
+                raise BadModel(f"{top.at(key)}: '{name}' is not known; {one_of(known, name)}")
+    if any(len(limb) < 2 for limb in table.draw.limbs):
+        raise BadModel(f'{top.at("draw.limbs")}: lists of points are wanted, as [["hip", "knee", "ankle"]]')
+    read_axes(top, table.up, table.forward)
+    for name, segment in table.segments.items():
+        place = f"segments.{name}."
+        if segment.up is not None or segment.forward is not None:
+            read_axes(replace(top, values={"up": segment.up, "forward": segment.forward}, place=place))
+        try:
+            re.compile(segment.labels)
+        except re.error as error:
+            labels = f"{top.at(place)}labels = {segment.labels!r}"
+            raise BadModel(f"{labels} is no regular expression: {error}") from None
+
+
+def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
+    """Return the table for a URDF with these links: one beside it, else one of the package that fits; None: none does.
+
+    Beside it is ``model.toml`` if it names the URDF, or ``<name of the URDF>.toml`` if it is a table. A table of the
+    package fits if the URDF has the links of the segments that need a sensor; of several the largest does.
+    """
+    links, own_table, named_alike = set(links), urdf.parent / MODEL_TABLE, urdf.with_suffix(".toml")
+    if own_table.is_file() and Path((table := read_table(own_table)).urdf).name == urdf.name:
+        return table
+    if named_alike.is_file() and "segments" in read_toml(named_alike, "the table of a body", BadModel):
+        return read_table(named_alike)
+    order = sorted(map(load_table, _list_bodies()), key=lambda body: (-len(body.segments), body.name != DEFAULT_BODY))
+    for table in order:
+        if links.issuperset(table.segments[name].link for name in table.needed):
+            segments = {name: segment for name, segment in table.segments.items() if segment.link in links}
+            points = {name: point for name, point in table.points.items() if point.link in links}
+            return prune_table(replace(table, segments=segments, points=points, where=f"{urdf}: by {table.name}.toml"))
+    return None
+
+
+def format_table(table: BodyTable, urdf: str) -> str:
+    """Return the text of a table's file that names `urdf`, a URDF beside it."""
+    return "\n".join(format_record(replace(table, urdf=urdf))) + "\n"

@@ -94,26 +94,22 @@ def parse_tree(robot: Any, where: str) -> Tree:
             raise BadModel(f"{where}: joint '{joint.name}': origin or axis is not three numbers each, of m and rad")
     roots = [name for name in below if name not in above]
     if len(roots) != 1:
-        names = ", ".join(roots) if roots else "none"
+        names = ", ".join(roots) or "none"
         raise BadModel(f"{where}: {len(roots)} links without a joint above them ({names}); a body has one root")
     tree = Tree(roots[0], above, below)
-    lost = set(below).difference(tree.hanging(tree.root))
-    if lost:
+    if lost := set(below).difference(tree.hanging(tree.root)):
         raise BadModel(f"{where}: link '{min(lost)}' hangs in a loop of joints, apart from the root; a body is a tree")
     return tree
 
 
 def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
-    """A copy of the robot (yourdfpy) with links named after segments and points, and the table of these names.
+    """Name links of the robot (yourdfpy) after segments and points, in place; return it and the table of these names.
 
     A mechanism's segments have their links' frames, and so have those of a URDF whose links bear the segments' names.
     Else every segment frame equals W in the N-pose. At zero of its joints a body may stand otherwise, in a T-pose say.
-    There
-
-    - segments of the spine are upright: their frames are W's;
-    - others lie along the line between the points of their length. The shortest rotation that carries their long axis
-      there is their orientation; a segment without a length has that of the segment above;
-    - `up` and `forward` of a segment are taken in place of that.
+    There segments of the spine are upright. Others lie along the line between the points of their length, by the
+    shortest rotation of their long axis; a segment without a length is as the segment above. `up` and `forward` of a
+    segment are taken in place of that.
     """
     tree = parse_tree(robot, table.where)
     places = [(f"segments.{name}", segment.link) for name, segment in table.segments.items()]
@@ -121,34 +117,29 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
     for place, link in [*places, *(("root", link) for link in table.root)]:
         if link not in tree.below:
             raise BadModel(f"{table.where}: {place}: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
-    R_WM = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()  # M: the root link
-    M_WM = np.eye(4)
-    M_WM[:3, :3] = R_WM
-    M_WM[:3, 3] = -R_WM @ np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
+    M_WM = np.eye(4)  # M: the root link
+    M_WM[:3, :3] = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()
+    origin = np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
+    M_WM[:3, 3] = -M_WM[:3, :3] @ origin
     M_WK = {link: M_WM @ tree.neutral(link) for link in tree.below}  # K: a link of theirs
     p_W = {name: M_WK[point.link][:3, :3] @ point.at + M_WK[point.link][:3, 3] for name, point in table.points.items()}
 
     segment_of = {segment.link: name for name, segment in reversed(list(table.segments.items()))}
     R_WL: dict[str, np.ndarray] = {}  # orientation of our segments while their joints are at zero
+    frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # name → their link, R_WL, p_W
     for name in sorted(table.segments, key=lambda name: len(tree.path(table.segments[name].link))):
         above = _segment_above(tree, table.segments[name].link, segment_of)
         R_WL[name] = _neutral_orientation(table, name, M_WK, p_W, np.eye(3) if above is None else R_WL[above])
-
-    frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # name → their link, R_WL, p_W
-    points: dict[str, Point] = {}
     for name, segment in table.segments.items():
         frames[name] = segment.link, R_WL[name], M_WK[segment.link][:3, 3]
+    points: dict[str, Point] = {}
     for name, point in table.points.items():
-        begins = segment_of.get(point.link)
-        if begins is not None and not any(point.at):
-            points[name] = Point(begins)
-            continue
-        points[name] = Point(name)
-        if point.link == name and not any(point.at):
-            continue  # the link is there already
-        carrier = begins or _segment_above(tree, point.link, segment_of)
-        link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
-        frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
+        begins = None if any(point.at) else segment_of.get(point.link)
+        points[name] = Point(begins or name)
+        if begins is None and (point.link != name or any(point.at)):  # else the link is there already
+            carrier = segment_of.get(point.link) or _segment_above(tree, point.link, segment_of)
+            link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
+            frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
     segments = {name: segment._replace(link=name, up=None, forward=None) for name, segment in table.segments.items()}
     named = replace(table, segments=segments, points=points, up="+z", forward="+x", root=())
     return _with_links(robot, tree.root, M_WM, M_WK, frames), named
@@ -194,13 +185,11 @@ def _with_links(
     M_WK: Mapping[str, np.ndarray],
     frames: Mapping[str, tuple[str, np.ndarray, np.ndarray]],
 ) -> Any:
-    """A copy of the robot with the links `frames` (name → the link it is fixed to, R_WL, p_WL), on a root that is W.
+    """Add the links `frames` (name → the link it is fixed to, R_WL, p_WL) to the robot, on a root that is W.
 
     A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
     """
-    yourdfpy = import_yourdfpy()
-    robot = copy_robot(robot)
-    added = {}
+    yourdfpy, added = import_yourdfpy(), {}
     for name, (link, R, p) in frames.items():
         M_WL = np.eye(4)
         M_WL[:3, :3], M_WL[:3, 3] = R, p
@@ -232,12 +221,9 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
     Second and third: its spherical joints and their axes, as `BodyModel` has them. Other joints have the URDF's limits.
     Without `spherical` triples of revolute joints stay as they are.
     """
-    tree = parse_tree(robot, where)
-    links = {link.name: link for link in robot.links}
-    model = pin.Model()
+    tree, links = parse_tree(robot, where), {link.name: link for link in robot.links}
+    model, joints, axes = pin.Model(), dict[str, int](), dict[str, np.ndarray]()
     model.name = robot.name or "body"
-    joints: dict[str, int] = {}
-    axes: dict[str, np.ndarray] = {}
 
     def carry(link: str, parent: int, M_JL: pin.SE3) -> None:
         inertial = links[link].inertial
@@ -290,16 +276,14 @@ def _triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> list[Any] | Non
     chain = [first]
     while len(chain) < 3:
         below, link = tree.below[chain[-1].child], links[chain[-1].child]
-        heavy = link.inertial is not None and (link.inertial.mass or 0.0) > _LIGHT
-        if len(below) != 1 or link.visuals or link.collisions or heavy:
+        is_heavy = link.inertial is not None and (link.inertial.mass or 0.0) > _LIGHT
+        if len(below) != 1 or link.visuals or link.collisions or is_heavy:
             return None
         chain.append(below[0])
-    if any(joint.type not in ("revolute", "continuous") for joint in chain):
-        return None
-    if any(np.linalg.norm(joint_placement(joint)[:3, 3]) > _MEET_TOLERANCE for joint in chain[1:]):
-        return None
+    turn = all(joint.type in ("revolute", "continuous") for joint in chain)
+    meet = all(np.linalg.norm(joint_placement(joint)[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
     axes = _axes(chain)
-    return chain if np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE else None
+    return chain if turn and meet and np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE else None
 
 
 def _axes(chain: list[Any]) -> np.ndarray:
@@ -342,10 +326,11 @@ def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: st
             f"{where}: joint '{joint.name}' is of type '{joint.type}', axis {axis.tolist()}; fixed, floating, or "
             f"{', '.join(kinds)} about an axis are known"
         )
-    limit = joint.limit
-    effort = np.inf if limit is None or limit.effort is None else float(limit.effort)
-    velocity = np.inf if limit is None or limit.velocity is None else float(limit.velocity)
-    limits = (np.array([number]) for number in (effort, velocity, *_find_bounds(joint)))
+    most = (
+        np.inf if number is None else float(number)
+        for number in (getattr(joint.limit, "effort", None), getattr(joint.limit, "velocity", None))
+    )
+    limits = (np.array([number]) for number in (*most, *_find_bounds(joint)))
     return int(model.addJoint(parent, kinds[joint.type](axis), M, joint.name, *limits))
 
 

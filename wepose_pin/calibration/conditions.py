@@ -9,7 +9,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..body.lengths import UNIVERSE
-from ..body.start_pose import StartPose
+from ..body.mounts import StartPose
 from ..errors import BadSession
 from ..observations.directions import Level, Pointing
 from ..observations.paths import ZERO_LENGTH, PointPath, SegmentVector, find_path

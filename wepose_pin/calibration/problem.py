@@ -11,8 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel
-from ..body.mounts import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
-from ..body.start_pose import StartPose, find_start_pose
+from ..body.mounts import (
+    MAX_MOUNT_ERROR_DEG,
+    MOUNT_WARNING_DEG,
+    StartPose,
+    compute_heading_offset,
+    find_nominal_mount,
+    find_start_pose,
+)
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase

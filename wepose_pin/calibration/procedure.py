@@ -37,7 +37,7 @@ from ..body import BodyModel, BodyTable, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
 from ..body.girdle import PARAMETERS
 from ..body.subject import Subject, girdle_rows, population_subject
-from ..body.table_file import check_segments
+from ..body.table import check_segments
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording

@@ -28,7 +28,7 @@ import numpy as np
 from ..assets import asset
 from ..body import BodyTable, list_breadths
 from ..body.mounts import PALM_SLIP_STD
-from ..body.table_file import check_segments
+from ..body.table import check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
 

@@ -155,4 +155,4 @@ def _tape_breadths(measured: Mapping[str, float]) -> dict[str, float]:
     from ..body import list_breadths, load_table
 
     breadths = list_breadths(load_table())
-    return {name: measured[breadth.length] / breadth.ratio for name, breadth in breadths.items()}
+    return {name: measured[length] / ratio for name, (length, ratio, _) in breadths.items()}

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..body import BodyModel, load_table
-from ..body.covariance import compute_axis_std
 from ..body.kinematics import KinematicsSolver
+from ..body.links import compute_axis_std
+from ..body.mounts import compute_start_configuration
 from ..body.soft_tissue import SoftTissueCorrection
-from ..body.start_pose import compute_start_configuration
-from ..body.table_file import check_segments
+from ..body.table import check_segments
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, ExistingOutput, WeposeError
 from ..filters import BEST

@@ -11,7 +11,7 @@ import numpy as np
 from ..body import BodyModel
 from ..body.girdle import PARAMETERS
 from ..body.lengths import UNIVERSE
-from ..body.start_pose import StartPose
+from ..body.mounts import StartPose
 from .paths import BodySymbols, express_covariance, express_path, find_girdles, find_path
 from .symbols import about_z, evaluate, product, rotate
 

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ..body import BodyModel
-from ..body.start_pose import StartPose
+from ..body.mounts import StartPose
 from ..body.table import Vector
 from .symbols import about_z, evaluate, product, rotate, rotate_back
 

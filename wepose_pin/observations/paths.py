@@ -17,7 +17,7 @@ from ..body import BodyModel, Girdle
 from ..body.girdle import displace, find_girdle_scale
 from ..body.lengths import UNIVERSE
 from ..body.links import find_carrier
-from ..body.start_pose import StartPose
+from ..body.mounts import StartPose
 from ..body.table import Vector
 from ..errors import BadSession
 from .symbols import rotate, rotate_back

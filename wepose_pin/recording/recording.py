@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, check_value
+from ..arguments import Positive, check_array, check_fields, check_numbers, check_value
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, one_of
@@ -289,9 +289,7 @@ def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
         if abs(length[k] - 1.0) > 1e-6:
             raise BadData(f"{place}.orientation: no unit quaternion at {time[k]:.3f} s: length {length[k]:.6g}")
     if sensor.stated_quat_LS is not None:
-        check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,))
-        check_finite(f"{place}.stated_quat_LS", sensor.stated_quat_LS)
-        check_unit(f"{place}.stated_quat_LS", sensor.stated_quat_LS, 1e-6)
+        check_numbers(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
     if sensor.gap is not None:
         check_array(f"{place}.gap", sensor.gap, (len(time),), "b", EACH_TIME)
 

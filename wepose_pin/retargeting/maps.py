@@ -180,7 +180,9 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
     keys = read_record(_Keys, top, {"axes": AXES}, others=("format", "limits"))
     _check_axes(top, "up", "forward")
-    sides = top.table("arms").tables(SIDES, "side")
+    arms = top.table("arms")
+    arms.allow(*SIDES)
+    sides = {side: arms.table(side) for side in arms.values}
     if not keys.arms:
         raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
     for side, arm in keys.arms.items():

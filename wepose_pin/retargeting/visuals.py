@@ -9,8 +9,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from ..body.urdf import find_mesh, package_folders
-from ..body.visuals import reduce_triangles, triangulate
+from ..body.urdf import find_mesh, package_folders, reduce_triangles, triangulate
 from .robot import Robot
 from .trajectory import Trajectory
 

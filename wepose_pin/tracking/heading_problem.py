@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel
-from ..body.mounts import compute_start_heading_var, find_mount_covariance
-from ..body.start_pose import StartPose
+from ..body.mounts import StartPose, compute_start_heading_var, find_mount_covariance
 from ..body.subject import Subject
 from ..calibration import load_protocol
 from ..errors import BadSession

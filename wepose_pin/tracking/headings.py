@@ -19,8 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..body.mounts import compute_start_heading_var
-from ..body.start_pose import StartPose
+from ..body.mounts import StartPose, compute_start_heading_var
 from ..filters.butterworth import BandPass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
 from .heading_filter import HeadingEstimate, HeadingFilter, Process, estimate_headings, find_care, symmetric

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel, BodyTable
-from ..body.covariance import compute_axis_std, compute_point_covariances
 from ..body.kinematics import Pose
+from ..body.links import compute_axis_std, compute_point_covariances
 from ..body.soft_tissue import correct_table
 from ..body.subject import Subject
 from ..filters import Orientation

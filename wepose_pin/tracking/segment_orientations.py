@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..body import BodyTable
-from ..body.mounts import MEASURED_ORIENTATION_STD, compute_start_heading_var, find_start_mount_covariance
-from ..body.start_pose import StartPose
+from ..body.mounts import MEASURED_ORIENTATION_STD, StartPose, compute_start_heading_var, find_mount_covariance
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..errors import BadOption
@@ -117,7 +116,7 @@ def compute_segment_covariance(
     # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
     # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
     R_WL = R @ start_pose.to_world(segment, R_LS).inv().as_matrix()
-    mount_cov = find_start_mount_covariance(recording, segment, subject, start_pose)
+    mount_cov = find_mount_covariance(recording, segment, subject, start_pose)
     start_var = start_pose.std(segment) ** 2
     vertical = np.array([0.0, 0.0, 1.0])
     if mount_cov is not None and subject is not None:  # whose mount it is

@@ -15,8 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..body import BodyModel
-from ..body.mounts import align_sensors, collect_nominal_mounts, compute_heading_offset, compute_start_heading_var
-from ..body.start_pose import N_POSE, StartPose
+from ..body.mounts import (
+    N_POSE,
+    StartPose,
+    align_sensors,
+    collect_nominal_mounts,
+    compute_heading_offset,
+    compute_start_heading_var,
+)
 from ..body.subject import Subject
 from ..compilation import kernel
 from ..diagnostics import drop_consequences

@@ -10,12 +10,12 @@ import numpy as np
 
 from ..body import BodyModel
 from ..body.body import load_sensed_model
-from ..body.covariance import compute_point_covariances
 from ..body.kinematics import KinematicsSolver
+from ..body.links import compute_point_covariances
+from ..body.mounts import StartPose, find_start_pose
 from ..body.soft_tissue import SoftTissueCorrection, correct_table
-from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject, population_subject
-from ..body.table_file import check_segments
+from ..body.table import check_segments
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.phases import BEGINNING_S

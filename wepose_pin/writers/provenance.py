@@ -18,7 +18,7 @@ from typing import Any
 
 from .. import __version__
 from ..assets import asset
-from ..body.table_file import MODEL_TABLE
+from ..body.table import MODEL_TABLE
 from ..documents import parse_toml, whole_folder
 from ..errors import ExistingOutput
 from ..libraries import check_file, library_errors

@@ -27,8 +27,8 @@ from ..arguments import check_arguments
 from ..body import BodyModel, load_model, load_table
 from ..body.kinematics import Pose, build_pose_table, find_samples, parse_pose_table
 from ..body.subject import Subject, load_subject, subject_toml
-from ..body.table_file import MODEL_TABLE, format_table
-from ..data_tables import open_source, read_columns, read_table
+from ..body.table import MODEL_TABLE, format_table
+from ..data_tables import read_columns, read_table
 from ..diagnostics import from_json
 from ..errors import MissingFile
 from ..libraries import library_errors
@@ -71,10 +71,9 @@ def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = 
         if len(files) == 1:
             files[0].rename(folder / name)
             continue
-        sources: list[Any] = [open_source(file) for file in files]
         try:
             with (folder / name).open("wb") as out:
-                pl.scan_parquet(sources).sink_parquet(out, row_group_size=ROW_GROUP)
+                pl.scan_parquet(files).sink_parquet(out, row_group_size=ROW_GROUP)
         except pl.exceptions.PolarsError as error:  # which has the system's text and no number
             raise OSError(errno.ENOSPC, str(error).splitlines()[0]) from error
         for file in files:

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ..body.urdf import package_folders
-from ..body.visuals import Mesh, Visual, reduce_triangles, triangulate, visuals
+from ..body.urdf import Mesh, Visual, list_visuals, package_folders, reduce_triangles, triangulate
 from ..errors import BadOption, how_to_install, native_stderr_muted
 from .joint_motion import ROBOT_URDF, JointMotion, compute_link_poses_W
 
@@ -32,7 +31,7 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     recording.save(path)
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     index = [rr.TimeColumn(TIMELINE, duration=motion.time)]
-    shapes = visuals(motion.robot)
+    shapes = list_visuals(motion.robot)
     for link, (quat, p) in compute_link_poses_W(motion).items():
         entity = f"body/{rr.escape_entity_path_part(link)}"
         if np.ptp(p, axis=0).any() or np.ptp(quat, axis=0).any():
