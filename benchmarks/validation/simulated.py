@@ -287,8 +287,8 @@ def calibrate_person(
     measured: Sequence[str] = MEASURED,
     formulation: Formulation = "full",
 ) -> Subject:
-    """Calibrate with the person's measured lengths of these names."""
-    return calibrate(
+    """Calibrate with the person's measured lengths of these names; a failed calibration is scored as any other."""
+    subject = calibrate(
         recording,
         measured={name: person.measured[name] for name in measured},
         prior=prior,
@@ -296,6 +296,7 @@ def calibrate_person(
         measured_std=person.measured_std,
         formulation=formulation,
     ).subject
+    return replace(subject, quality="")
 
 
 def collect_hand_errors(errors: Evaluation) -> dict[str, float | tuple[float, float]]:
