@@ -240,16 +240,9 @@ def build_recording(
 ) -> Recording:
     """Build a recording from consecutive ticks, up to the tick `last`; lost samples are bridged and marked.
 
-    Parameters
-    ----------
-    header : name, sensors, mounts, phases, start_pose, remounted, joints, model, as in `HEAD`
-    start : first and last tick of the start pose; None: that of the header's phases
-    resets : ticks before which the headings were reset
-
-    Raises
-    ------
-    BadData
-        A sensor never sent a sample.
+    `header` has name, sensors, mounts, phases, start_pose, remounted, joints and model. `start`: first and last tick of
+    the start pose; None: that of the header's phases. `resets`: ticks before which the headings were reset. `BadData`
+    is raised where a sensor never sent a sample.
     """
     ticks = [t for t in ticks if len(t.time)]
     first = ticks[0].first

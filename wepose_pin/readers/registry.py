@@ -24,23 +24,15 @@ from .xdf import read_xdf
 
 
 class Format(NamedTuple):
-    """A format of a device or program.
+    """A format of a device or program."""
 
-    Parameters
-    ----------
-    title : what a file of it is called
-    detects : path, which may be a folder, and the first lines of a text → whether it is of this format
-    read : path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents: raw data where a sensor has
-        them, else orientations, or only what is asked for; with a rate its times are replaced
-    whole : all sensors of a recording are in one file
-    folder : a recording may be a folder
-    """
-
-    title: str
-    detects: Callable[[Path, str], bool]
+    title: str  # what a file of it is called
+    detects: Callable[[Path, str], bool]  # path, which may be a folder, and the first lines of a text → is it one?
+    # Path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents: raw data where a sensor has them,
+    # else orientations, or only what is asked for; with a rate its times are replaced.
     read: Callable[[Path, str | None, float | None], Device]
-    whole: bool = False
-    folder: bool = False
+    whole: bool = False  # all sensors of a recording are in one file
+    folder: bool = False  # a recording may be a folder
 
 
 TEXTS = (".json", ".csv", ".tsv", ".txt", ".xml")  # whose first lines may tell the format

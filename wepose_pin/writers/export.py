@@ -46,23 +46,15 @@ MOTION = ("rate_hz", "interval", "phase")  # options of a format with a motion
 
 
 class Format(NamedTuple):
-    """A format of others.
+    """A format of others."""
 
-    Parameters
-    ----------
-    of : what it holds: `PERSON`, `JOINTS`, `ROBOTS` or `BODY`
-    write : path, motion and own options → what the file cannot hold, or None. A format of `ROBOTS` gets all motions,
-        one of `BODY` the result
-    options : that it has of those of `export`
-    suffix : of the file; None: the name of the format. Empty: a folder
-    earlier : patterns of the files of an earlier run in the folder, which `force` replaces
-    """
-
-    of: str
+    of: str  # what it holds: `PERSON`, `JOINTS`, `ROBOTS` or `BODY`
+    # Path, motion and own options → what the file cannot hold, or None. A format of `ROBOTS` gets all motions, one of
+    # `BODY` the result.
     write: Callable[..., list[Diagnostic] | None]
-    options: tuple[str, ...] = MOTION
-    suffix: str | None = None
-    earlier: tuple[str, ...] = ()
+    options: tuple[str, ...] = MOTION  # that it has of those of `export`
+    suffix: str | None = None  # of the file; None: the name of the format. Empty: a folder
+    earlier: tuple[str, ...] = ()  # patterns of the files of an earlier run in the folder, which `force` replaces
 
 
 def write_urdf(file: Path, result: Result) -> None:
@@ -125,16 +117,10 @@ def list_formats() -> dict[str, Format]:
 
 
 class Exported(NamedTuple):
-    """What `export` wrote.
+    """What `export` wrote."""
 
-    Parameters
-    ----------
-    format : one of `list_formats`
-    diagnostics : what of the result the format cannot hold
-    """
-
-    format: str
-    diagnostics: list[Diagnostic]
+    format: str  # one of `list_formats`
+    diagnostics: list[Diagnostic]  # what of the result the format cannot hold
 
     def __repr__(self) -> str:
         return f"Exported({self.format!r}; {len(self.diagnostics)} diagnostics)"

@@ -35,39 +35,23 @@ _ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class JointMotion:
-    """A motion by the joints of a URDF.
+    """A motion by the joints of a URDF."""
 
-    Parameters
-    ----------
-    name : of the recording of a person, of the robot
-    where : the result's folder, for error texts
-    robot, urdf : the URDF as yourdfpy has it, and its text
-    joints : names of those that move
-    time : (n,) [s]
-    position, velocity : (n, joints) [rad or m, s]
-    posture : joint that stays → its value; zero where not named
-    p_WB, quat_WB : (3,) [m], (4,) xyzw of the root link in W
-    recorded_time : (n,) [s] of the recording at each sample
-    phases : of the recording; `REPETITIONS` among them are the repetitions of the movement
-    begin : the first sample after the robot's approach
-    source : name of the recording that a robot follows
-    """
-
-    name: str
-    where: str
-    robot: Any
-    urdf: str
-    joints: tuple[str, ...]
-    time: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    posture: Mapping[str, float]
-    p_WB: np.ndarray
-    quat_WB: np.ndarray
-    recorded_time: np.ndarray
-    phases: Mapping[str, Intervals] = field(default_factory=dict)
-    begin: int = 0
-    source: str = ""
+    name: str  # of the recording of a person, of the robot
+    where: str  # the result's folder, for error texts
+    robot: Any  # the URDF as yourdfpy has it
+    urdf: str  # its text
+    joints: tuple[str, ...]  # names of those that move
+    time: np.ndarray  # (n,) [s]
+    position: np.ndarray  # (n, joints) [rad or m]
+    velocity: np.ndarray  # (n, joints) [rad/s or m/s]
+    posture: Mapping[str, float]  # joint that stays → its value; zero where not named
+    p_WB: np.ndarray  # (3,) [m] of the root link in W
+    quat_WB: np.ndarray  # (4,) xyzw of the root link in W
+    recorded_time: np.ndarray  # (n,) [s] of the recording at each sample
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # `REPETITIONS` are those of the movement
+    begin: int = 0  # the first sample after the robot's approach
+    source: str = ""  # name of the recording that a robot follows
 
     @property
     def rate_hz(self) -> float:

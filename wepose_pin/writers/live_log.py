@@ -26,16 +26,9 @@ _encode = json.JSONEncoder(separators=(",", ":")).encode
 class LiveLog:
     """A file that holds all that was received, up to a quarter of a second before any end.
 
-    A full disk ends the recording and not the session: `problem` holds the reason.
-
-    Parameters
-    ----------
-    header : what is known before the first sample; `sensors` gives the order of columns
-
-    Raises
-    ------
-    ExistingOutput
-        The file is there and `force` is not given; it cannot be written.
+    A full disk ends the recording and not the session: `problem` holds the reason. The header is what is known before
+    the first sample; its `sensors` give the order of columns. `ExistingOutput` is raised where the file is there and
+    `force` is not given, or it cannot be written.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], force: bool = False) -> None:

@@ -19,19 +19,12 @@ SLACK_S = 1e-6  # [s] by which times that are written with digits differ
 
 @dataclass(frozen=True)
 class Motion:
-    """A result, read back.
-
-    Parameters
-    ----------
-    pose, model : as `read_result` gives them
-    name : of the recording
-    where : the result's folder, for error texts
-    """
+    """A result, read back."""
 
     pose: Pose
     model: BodyModel
-    name: str
-    where: str
+    name: str  # of the recording
+    where: str  # the result's folder, for error texts
 
     @property
     def rate_hz(self) -> float:

@@ -50,15 +50,8 @@ def code() -> dict[str, str | None]:
 def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Collect the provenance of what a command makes.
 
-    Parameters
-    ----------
-    command : as on the command line, or `CALL`
-    values : its options; those that name existing files are inputs
-
-    Raises
-    ------
-    MissingFile
-        An input cannot be read.
+    `command` is as on the command line, or `CALL`; `values` are its options: those that name existing files are inputs.
+    `MissingFile` is raised where one cannot be read.
     """
     inputs: dict[str, Path] = {}
     options: dict[str, Any] = {}
@@ -88,10 +81,7 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
 def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
     """Compute SHA-256 of all that an input consists of (`list_files`), by its name relative to the input's folder.
 
-    Raises
-    ------
-    MissingFile, BadData
-        A file is missing, or cannot be read.
+    `MissingFile` or `BadData` is raised where a file is missing, or cannot be read.
     """
     top = path if path.is_dir() else path.parent
     hashes = {}

@@ -89,11 +89,8 @@ def write_about(
 ) -> None:
     """Write the files of a result beside its poses.
 
-    Parameters
-    ----------
-    tracked : the last chunk; the phases of its recording go to the summary, and pages made from the folder show them
-    torques : become ``torques.parquet``
-    provenance : becomes part of the summary
+    `tracked` is the last chunk; the phases of its recording go to the summary, and pages made from the folder show
+    them. `torques` become ``torques.parquet``, `provenance` becomes part of the summary.
     """
     content = summary.content
     if torques is not None:
