@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -224,13 +223,6 @@ def test_c3d_on_a_full_disk_leaves_the_earlier_file(
     with pytest.raises(ExistingOutput, match=r"x\.c3d: cannot be written: the disk seems to be full"):
         export(result, tmp_path / "x.c3d", force=True)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("x.c3d", "earlier")]
-
-
-def test_c3d_without_ezc3d(result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ezc3d", None)
-    with pytest.raises(BadOption, match="pip install ezc3d"):
-        export(result, tmp_path / "x.c3d")
-    assert list(tmp_path.iterdir()) == []
 
 
 # BVH --------------------------------------------------------------------------------------------------------------

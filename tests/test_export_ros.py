@@ -149,14 +149,15 @@ def test_a_rate_and_a_phase_of_a_trajectory(trajectory: Path, motion: JointMotio
 
 
 @pytest.mark.parametrize(
-    ("module", "name", "package"), [("rosbags.interfaces", "x.mcap", "rosbags"), ("rerun", "x.rrd", "rerun-sdk")]
+    ("module", "name", "package"),
+    [("rosbags.interfaces", "x.mcap", "rosbags"), ("rerun", "x.rrd", "rerun-sdk"), ("ezc3d", "x.c3d", "ezc3d")],
 )
 def test_without_its_package_a_format_says_which(
-    trajectory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str, package: str
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(BadOption, match=f"pip install {package}"):
-        export(trajectory, tmp_path / name)
+        export(result, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 

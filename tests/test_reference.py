@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -189,13 +188,6 @@ def test_a_header_may_count_more_frames_than_there_are(brief: Pose, tmp_path: Pa
     reference = read_reference(path)
     np.testing.assert_array_equal(reference.time, whole.time)
     np.testing.assert_array_equal(reference.points["left_elbow"], whole.points["left_elbow"])
-
-
-def test_without_ezc3d_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.c3d").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "ezc3d", None)
-    with pytest.raises(BadData, match=r"a\.c3d: is a C3D, which needs ezc3d: pip install ezc3d"):
-        read_reference(tmp_path / "a.c3d")
 
 
 @pytest.mark.parametrize(("write", "name"), [(c3d, "a.c3d"), (trc, "a.trc")])
