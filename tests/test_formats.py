@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import zipfile
 from collections.abc import Callable
@@ -323,7 +322,7 @@ def test_a_shimmer_beyond_the_range_of_its_low_noise_accelerometer_is_read_by_th
     np.testing.assert_allclose(accel, ACCEL + 0.1, atol=1e-6)
 
 
-def test_phones_as_zip_and_json_and_side_by_side(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_phones_as_zip_and_side_by_side(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for name in ("chest", "left_wrist"):
         df.sensor_logger(tmp_path / name)
     info(capsys, tmp_path / "chest", "--write")
@@ -333,15 +332,6 @@ def test_phones_as_zip_and_json_and_side_by_side(capsys: pytest.CaptureFixture[s
             for file in folder.iterdir():
                 archive.write(file, file.name)
         check_raw(load_file(tmp_path, zipped))
-    entries = [{"sensor": "Metadata", "platform": "ios"}]
-    for name, values in (("Gyroscope", GYRO), ("TotalAcceleration", -ACCEL)):
-        for k in range(N):
-            axes = dict(zip("zyx", (f"{v:.9g}" for v in values[k, ::-1]), strict=True))
-            stamp = {"time": str(1000 * df.US0 + 10_000_000 * k), "seconds_elapsed": f"{TIME[k]}"}
-            entries.append({"sensor": name, **stamp, **axes})
-    (tmp_path / "chest.json").write_text(json.dumps(entries))
-    assert detect_format(tmp_path / "chest.json") == "sensor_logger"
-    check_raw(load_file(tmp_path, "chest.json"))
     (tmp_path / "chest" / "Metadata.csv").unlink()
     assert [each.code for each in read_device(tmp_path / "chest", "sensor_logger").diagnostics] == ["file-assumption"]
 

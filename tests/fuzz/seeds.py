@@ -173,20 +173,6 @@ def descriptions() -> list[bytes]:
     return [(folder / "dot.toml").read_bytes()]
 
 
-def sensor_logger() -> bytes:
-    entries = [
-        {
-            "sensor": name,
-            "time": str(10**16 + 10**7 * k),
-            "seconds_elapsed": "0",
-            **dict(zip("xyz", map(str, row), strict=True)),
-        }
-        for name, values in (("Gyroscope", GYRO), ("TotalAcceleration", ACCEL))
-        for k, row in enumerate(values)
-    ]
-    return json.dumps([{"sensor": "Metadata", "platform": "ios"}, *entries]).encode()
-
-
 def xdf() -> bytes:
     def chunk(tag: int, content: bytes) -> bytes:
         return b"\x04" + struct.pack("<IH", len(content) + 2, tag) + content

@@ -283,7 +283,6 @@ TARGETS = (
     Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES),
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES),
     Target("description", seeds.descriptions, file("lab.toml", _description), TOML),
-    Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON),
     Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), ()),
     Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES),
     Target("markers", lambda: [seeds.MARKERS], file("m.toml", _markers), TOML),

@@ -35,7 +35,7 @@ class Format(NamedTuple):
     folder: bool = False  # a recording may be a folder
 
 
-TEXTS = (".json", ".csv", ".tsv", ".txt", ".xml")  # whose first lines may tell the format
+TEXTS = (".csv", ".tsv", ".txt", ".xml")  # whose first lines may tell the format
 
 
 def _has_suffix(path: Path, *suffixes: str) -> bool:

@@ -1,24 +1,19 @@
-"""Sensor Logger, an app for phones: a folder or zip with a CSV for each sensor, or one JSON of all.
+"""Sensor Logger, an app for phones: a folder or zip with a CSV for each sensor.
 
 Columns ``time`` [ns since 1970], ``seconds_elapsed``, then the axes from z to x. Gyroscope [rad/s]; TotalAcceleration,
-or Accelerometer (without gravity) and Gravity [m/s²]; Orientation ``qz, qy, qx, qw`` to a world with z up. In the JSON
-all values are text. The signs of accelerations are Android's (+g up at rest); on an iPhone they are the opposite unless
-the app's setting standardises them, which Metadata says.
+or Accelerometer (without gravity) and Gravity [m/s²]; Orientation ``qz, qy, qx, qw`` to a world with z up. The signs of
+accelerations are Android's (+g up at rest); on an iPhone they are the opposite unless the app's setting standardises
+them, which Metadata says.
 
 Source: tszheichoi/awesome-sensor-logger, the app's description of its exports, and published recordings.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-
-import polars as pl
 
 from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
-from ..libraries import library_errors
 from .device import Device, Signal, join_signals, make_device, open_folder, read_first_lines
 
 COLUMNS = {
@@ -30,9 +25,6 @@ NEEDS = "Gyroscope with TotalAcceleration, or Accelerometer and Gravity, nor Ori
 
 def is_sensor_logger(path: Path) -> bool:
     """Return whether a folder, a zip or a file is one of Sensor Logger's."""
-    if path.suffix.lower() == ".json":
-        start = "".join(read_first_lines(path, 3))[:2000]
-        return '"seconds_elapsed"' in start and '"sensor"' in start
     alone = path.is_file() and path.suffix.lower() != ".zip"
     with open_folder(path) as files:
         names = [path.name] if alone else [f"{name}.csv" for name in COLUMNS]
@@ -42,7 +34,9 @@ def is_sensor_logger(path: Path) -> bool:
 
 def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """Read a phone, as `Format.read`."""
-    tables = _read_tables(path)
+    with open_folder(path) as files:
+        names = [name for name in (*COLUMNS, "Metadata") if f"{name}.csv" in files]
+        tables = {name: read_table(files[f"{name}.csv"]) for name in names}
     signals = {}
     for name in (name for name in COLUMNS if name in tables):
         values = read_columns(tables[name], ["time", *COLUMNS[name]], f"{name}.csv", str(path))
@@ -62,18 +56,6 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
         phone = {"gyro": signals["Gyroscope"], "accel": Signal(time, sign * accel)}
     if "Orientation" in signals:
         phone["orientation"] = signals["Orientation"]
-    folder = path if path.is_dir() or path.suffix.lower() in (".zip", ".json") else path.absolute().parent
+    folder = path if path.is_dir() or path.suffix.lower() == ".zip" else path.absolute().parent
     label = folder.stem if folder.is_file() else folder.absolute().name
     return make_device(path, {label: phone}, NEEDS, use, rate_hz, diagnostics)
-
-
-def _read_tables(path: Path) -> dict[str, pl.DataFrame]:
-    """Read the tables of the phone's sensors, and its metadata, by name."""
-    if path.suffix.lower() != ".json":
-        with open_folder(path) as files:
-            return {name: read_table(files[f"{name}.csv"]) for name in (*COLUMNS, "Metadata") if f"{name}.csv" in files}
-    with library_errors(path, "a JSON of Sensor Logger"):
-        by_sensor: dict[str, list[Mapping[str, str]]] = {}
-        for entry in json.loads(path.read_bytes()):
-            by_sensor.setdefault(entry["sensor"], []).append(entry)
-        return {name: pl.DataFrame(entries) for name, entries in by_sensor.items()}
