@@ -68,14 +68,7 @@ class Movement:
 def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], options: MovementOptions) -> Movement:
     """Compute the angles of a session, find its repetitions and measure them.
 
-    Parameters
-    ----------
-    phases : of the recording, [s]
-
-    Raises
-    ------
-    WeposeError
-        No joint has both of its segments; there is no such angle or phase; a cut-off that is not possible.
+    `WeposeError`: no joint has both of its segments; there is no such angle or phase; a cut-off that is not possible.
     """
     if options.cutoff_hz is not None:
         pose = smooth_pose(pose, options.cutoff_hz)
@@ -105,11 +98,6 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
 
     Nothing is delayed; at `cutoff_hz` the two passes together halve the amplitude (−6 dB). Filtered are the components
     of the quaternions, which are normalised afterwards. Points, covariances and gaps stay.
-
-    Raises
-    ------
-    WrongOption
-        The cut-off is not above 0 and below 0.45 of the sampling rate.
     """
     step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 1.0
     if not 0.0 < cutoff_hz < 0.45 / step:
@@ -130,13 +118,7 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
 
 
 def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float]] | np.ndarray) -> pl.DataFrame:
-    """A row an angle in each span [s], both ends included: `MEASURES` in degrees, each with its ±; NaN: not determined.
-
-    Raises
-    ------
-    BadData
-        A span has no sample.
-    """
+    """Build a row an angle in each span [s], both ends included: `MEASURES` in degrees, each with its ±."""
     parts = [find_samples(pose.time, (float(begin), float(end))) for begin, end in spans]
     rows = []
     for order, (name, joint) in enumerate(angles.joints.items()):

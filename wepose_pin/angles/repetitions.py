@@ -88,13 +88,8 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
 
     Parameters
     ----------
-    main_angle : as ``right_elbow_flexion``; None: that of `find_main_angle`
+    main_angle : as ``right_elbow_flexion``; None: that of `find_main_angle`; `WrongOption`: there is no such angle
     rising : the angle grows first in a repetition; None: by where it rests
-
-    Raises
-    ------
-    WrongOption
-        There is no such angle.
     """
     known = list_angles(angles)
     if main_angle is not None and main_angle not in known:
@@ -142,15 +137,10 @@ def _are_alike(curves: np.ndarray) -> np.ndarray:
 
 
 def find_movements(time: np.ndarray, *points: np.ndarray) -> np.ndarray:
-    """Find the movements between rests, spans (r, 2) [s], of hands that begin and end each one at rest.
+    """Find the movements between rests, spans (r, 2) [s], of hands (n, 3) [m] that begin and end each one at rest.
 
     Those whose duration differs much from the median one are other movements and left out. None where fewer than three
-    are left.
-
-    Parameters
-    ----------
-    time : (n,) [s], even
-    points : (n, 3) [m] each
+    are left. `time` (n,) [s] is even.
     """
     rate_hz = (len(time) - 1) / (time[-1] - time[0])
     moving = np.zeros(len(time), dtype=bool)

@@ -69,15 +69,8 @@ def compute_summary_std(pose: Pose, name: str, joint: JointAngles, samples: np.n
 
     Those of a range and of a rate are of two samples. Their error is taken once as constant in W, as that of a heading
     is, and once as constant in each segment, as that of a mount is; the larger standard deviation of the two counts.
-
-    Parameters
-    ----------
-    samples : (s, 3, 4) of the pose, as `JointSummary` has them for each of s spans
-
-    Returns
-    -------
-    np.ndarray
-        (s, 3, 4), of the lowest, the highest and the range [rad], and of the peak rate [rad/s]
+    `samples` (s, 3, 4) are those of `JointSummary` for each of s spans; of the same shape are the results: of the
+    lowest, the highest and the range [rad], and of the peak rate [rad/s].
     """
     stds = np.full(samples.shape, np.nan)
     if joint.std is None:

@@ -69,12 +69,8 @@ def joint_torques(
 
     Raises
     ------
-    BadModel
-        The model has no masses.
-    BadOption
-        A cut-off that is not above zero and below half the rate.
-    BadData
-        Too few samples to smooth.
+    BadModel, BadOption, BadData
+        The model has no masses; a cut-off that is not possible; too few samples to smooth.
     """
     mass = sum(inertia.mass for inertia in model.inertias[1:])
     if mass < _LEAST_MASS:

@@ -49,18 +49,11 @@ class Registration:
 def register(
     pose: Pose, truth: Pose, *, up: str | None = None, frames: bool = False, offset_s: float | None = None
 ) -> tuple[Pose, Registration]:
-    """Bring a reference to the clock and world of a pose; with what was fitted.
+    """Bring a reference to the clock and world of a pose; return it with what was fitted.
 
-    Parameters
-    ----------
-    up : the axis of the reference's world that is up, as "+z"; None: found
-    frames : fit a constant rotation of each segment's frame
-    offset_s : to add to the reference's times; None: found
-
-    Raises
-    ------
-    BadData
-        Nothing in common; too little time or motion; no axis of the reference's world is up.
+    `up` is the axis of the reference's world that is up, as "+z", `offset_s` [s] is added to its times; None: found.
+    `frames`: fit a constant rotation of each segment's frame. `BadData`: nothing in common; too little motion; no axis
+    of the reference's world is up.
     """
     segments = [name for name in pose.quat_WL if _is_known(truth.quat_WL.get(name))]
     names = [name for name in pose.points if _is_known(truth.points.get(name))]
@@ -117,9 +110,6 @@ def _sample_both(pose: Pose, truth: Pose, segment: str, time: np.ndarray) -> tup
     known = np.isfinite(sampled).all(axis=(0, 2))
     ours, theirs = (Rotation.from_quat(quat[known]) for quat in sampled)
     return ours, theirs
-
-
-# Clock -------------------------------------------------------------------------------------------------------------
 
 
 def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[float, float]:

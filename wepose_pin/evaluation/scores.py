@@ -116,15 +116,11 @@ def evaluate(
 
     Parameters
     ----------
-    pose : Pose or TrackResult
-        What `track` or `load_result` gives, or its `pose`.
-    truth : Pose or TrackResult
-        The reference. Where it is NaN, or has no sample near a time of the pose, that time is left out.
-    interval : (float, float), optional
-        From, to [s]; None: all of the time that both have.
-    table : BodyTable, optional
-        Of the body: it names the limbs, for errors of a hand relative to the shoulders. None: that of `pose`, where it
-        has a body, else the upper body's.
+    pose : what `track` or `load_result` gives, or its `pose`
+    truth : the reference; where it is NaN, or has no sample near a time of the pose, that time is left out
+    interval : from, to [s]; None: all of the time that both have
+    table : of the body: it names the limbs, for errors of a hand relative to the shoulders. None: that of `pose`, where
+        it has a body, else the upper body's
 
     Returns
     -------

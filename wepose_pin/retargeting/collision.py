@@ -43,13 +43,9 @@ class NearPairs(NamedTuple):
 class CollisionModel:
     """The robot's shapes, each as its convex hull: fast, and the nearest points move smoothly.
 
-    Its pairs are those of `select_pairs`, less those that collide in almost any posture, or, few joints apart on one
-    arm, in none.
-
-    Attributes
-    ----------
-    pairs : indices of two hulls each
-    clearance, least_distance : (pairs,) [m] that tasks leave, and that no step and no stop goes below
+    Its `pairs` of hulls are those of `select_pairs`, less those that collide in almost any posture, or, few joints
+    apart on one arm, in none. Tasks leave the `clearance` (pairs,) [m]; no step and no stop goes below
+    `least_distance`.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -126,16 +122,12 @@ class CollisionModel:
         return np.array([pin.computeDistance(self.hulls, self.data, k).min_distance for k in pairs.tolist()])
 
     def is_path_clear(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> bool:
-        """Whether all pairs keep their least distance on a way to rest.
+        """Return whether all pairs keep their least distance on a way to rest.
 
         The way is halved until each part is covered: from the distance of a pair follows how far its joints may move
         before the hulls can meet, by the length of the links between (as in conservative advancement, Mirtich 1996).
-
-        Parameters
-        ----------
-        distance : (pairs,) [m] at the beginning; a lower bound where a pair is far
-        path : (m, n) joint positions, the first after one step
-        travel : (m, n) largest way of each joint in each step
+        `distance` (pairs,) [m] is at the beginning, a lower bound where a pair is far; `path` (m, n) are joint
+        positions, the first after one step, and `travel` (m, n) the largest way of each joint in each step.
         """
         room_before = distance - self.least_distance
         critical = (self.levers @ travel.sum(axis=0) >= room_before).nonzero()[0]

@@ -129,13 +129,8 @@ def compute_separation_bounds(jacobian, distance, clearance, v, a, low, high, a_
 
     Bound 3 for several joints at once. It uses half of what all joints together can brake; the other half is a reserve
     for their own limits. The change of the acceleration within the coming step is subtracted. What joints cannot brake
-    is not asked for; at rest it is enough not to approach.
-
-    Parameters
-    ----------
-    jacobian : (m, n) of the distances [m/rad]
-    distance, clearance : (m,) [m]
-    v, a, low, high, a_max, j_max : (n,); `low` and `high` are the bounds of `compute_acceleration_bounds`
+    is not asked for; at rest it is enough not to approach. `jacobian` (m, n) is of the distances (m,) [m], `low` and
+    `high` (n,) are the bounds of `compute_acceleration_bounds`.
     """
     bounds = np.empty(len(distance))
     static = not (v.any() or a.any())

@@ -234,7 +234,7 @@ def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
 
 
 def _narrow_range(name: str, limit: JointLimit, margins: LimitMargins) -> tuple[float, float]:
-    """The position limits of a joint, less its margins [rad or m]."""
+    """Return the position limits of a joint, less its margins [rad or m]."""
     scale = SLIDE_M_PER_RAD if limit.kind == "prismatic" else 1.0
     margin = max(scale * margins.limit_margin, MIN_LIMIT_MARGIN)
     lower, upper = limit.lower + margin, limit.upper - margin
@@ -277,9 +277,8 @@ def _check_rest(robot: Robot, side: str, offset: np.ndarray) -> None:
     angle = np.degrees(np.arccos((x - z) / np.sqrt(2.0) / max(np.linalg.norm(offset), 1e-9)))
     if angle > MAX_REST_ANGLE_DEG:
         raise BadModel(
-            f"{robot.map.where}: rest: the {side} hand is {x:+.2f} m ahead of its shoulder, {y:+.2f} m to the left "
-            f"and {z:+.2f} m up, with base, up and forward as they are: {angle:.0f} deg off ahead and below, at most "
-            f"{MAX_REST_ANGLE_DEG:g}; give a rest for this mount, the arm hanging, the forearm ahead, or none"
+            f"{robot.map.where}: rest: the {side} hand is {x:+.2f} m ahead of its shoulder, {y:+.2f} m to the left and "
+            f"{z:+.2f} m up by base, up and forward; give a rest for this mount, the arm hanging, the forearm ahead"
         )
 
 

@@ -168,18 +168,10 @@ def _limit_norm(v: np.ndarray, limit: float) -> np.ndarray:
 
 
 class ArmObserver:
-    """Takes the arms that a robot needs from a live pose.
+    """Takes the arms that a robot needs from a live pose, of which `segments` and `points` are the rows.
 
-    Parameters
-    ----------
-    segments, points : rows of a live pose
-    table : of the person's body; None: the upper body
-    lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
-
-    Raises
-    ------
-    BadData
-        The pose lacks an arm of the robot.
+    `lengths_cov` (k, k) [m²] is of the person's lengths in the order of the table; None: exact. `BadData`: the pose
+    lacks an arm of the robot.
     """
 
     def __init__(
@@ -244,22 +236,11 @@ class ArmObserver:
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """Timing of a `CommandStream`.
+    """Timing of a `CommandStream`."""
 
-    Parameters
-    ----------
-    rate_hz : commands a second
-    hold_after, stop_after : [s] without a pose, after which the robot brakes, and stops until `resume`
-
-    Raises
-    ------
-    WrongOption
-        A value out of range.
-    """
-
-    rate_hz: float = 100.0
-    hold_after: float = HOLD_AFTER_S
-    stop_after: float = STOP_AFTER_S
+    rate_hz: float = 100.0  # commands a second
+    hold_after: float = HOLD_AFTER_S  # [s] without a pose, after which the robot brakes
+    stop_after: float = STOP_AFTER_S  # [s] without a pose, after which it stops until `resume`
 
     def __post_init__(self) -> None:
         if not 10.0 <= self.rate_hz <= 1000.0:
@@ -274,23 +255,17 @@ class CommandStream:
 
     It begins at rest in the robot's rest posture. Without a pose for `hold_after` it brakes, and continues when one
     comes; without one for `stop_after` it stops until `resume`.
-
-    Attributes
-    ----------
-    delay_s : [s] of the low-pass
-    state : of the robot at the last command
-    stopping : steps in which the robot braked, since none kept all limits and clearances and left a stop open
-    stuck : side → [m] by which its hand was off at most while it was stuck: its arm cannot come nearer from its posture
     """
 
     def __init__(self, robot: Robot, options: StreamOptions | None = None) -> None:
         self.robot, self.options = robot, options or StreamOptions()
         self.dt = 1.0 / self.options.rate_hz
         self._omega = 2.0 * np.pi * SMOOTHING_HZ
-        self.delay_s = 2.0 / self._omega
+        self.delay_s = 2.0 / self._omega  # [s] of the low-pass
         collision = CollisionModel(robot)
         self._controller = QpController(robot, collision, self.dt)
-        self.state, self.stopping = JointState.at_rest(robot.rest), 0
+        self.state = JointState.at_rest(robot.rest)  # at the last command
+        self.stopping = 0  # steps in which the robot braked, since none kept all limits and left a stop open
         no_target = HandTarget(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
         self._controller.step(self.state, (no_target,) * len(robot.arms))  # compiles before the robot moves
         self._controller = QpController(robot, collision, self.dt)
@@ -299,7 +274,7 @@ class CommandStream:
         self._observed: list[ArmObservation] = []
         self._low_passes: list[_LowPass] = []
         self._trust, self._stuck_s = np.ones(len(robot.arms)), np.zeros(len(robot.arms))
-        self.stuck: dict[str, float] = {}
+        self.stuck: dict[str, float] = {}  # side → [m] by which its hand was off at most while its arm was stuck
         self._references: list[_HandReference] | None = None
         self._approach_reason = self._stop_reason = self._end_reason = ""
 
@@ -382,7 +357,13 @@ class CommandStream:
             return self._command("approach", f"on the way to the person's hands{why}", error)
         self._approach_reason = ""
         arms = zip(self.robot.arms, self._observed, self._trust, strict=True)
-        poor = [_describe_doubt(arm.side, observation) for arm, observation, trust in arms if trust < TRUSTED]
+        poor = [
+            f"no samples from {', '.join(name.replace('_', ' ') for name in observation.lost)}"
+            if observation.lost
+            else f"the {arm.side} hand is uncertain by {1e3 * observation.std:.0f} mm"
+            for arm, observation, trust in arms
+            if trust < TRUSTED
+        ]
         reasons = [*poor, *self._find_stuck(targets, error[:, 0])]
         return self._command("slow" if poor else "follow", "; ".join(reasons), error)
 
@@ -431,9 +412,3 @@ def _jumps(before: list[ArmObservation], now: list[ArmObservation], dt: float) -
         or _norm(pin.log3(b.motion.rotation @ a.motion.rotation.T)) > JUMP_RATE * dt
         for a, b in zip(before, now, strict=True)
     )
-
-
-def _describe_doubt(side: str, observation: ArmObservation) -> str:
-    if observation.lost:
-        return f"no samples from {', '.join(name.replace('_', ' ') for name in observation.lost)}"
-    return f"the {side} hand is uncertain by {1e3 * observation.std:.0f} mm"

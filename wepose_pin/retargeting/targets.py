@@ -133,13 +133,7 @@ def map_arm(robot: Robot, scale: float, quat_WT: np.ndarray, quat_WH: np.ndarray
 
 
 def find_person_arm(table: BodyTable, side: str) -> Limb:
-    """The limb of a person that the robot's arm of this side ("left" or "right") follows: the first one of that side.
-
-    Raises
-    ------
-    BadData
-        The body has none with three segments on a base: upper arm, forearm, hand.
-    """
+    """Find the limb of a person that the robot's arm of this side follows: three segments on a base."""
     for tip, limb in table.drawn_limbs.items():
         if table.side(tip) == side and limb.base is not None and len(limb.segments) == len(limb.points) - 1 == LINKS:
             return limb
@@ -154,13 +148,7 @@ def find_hand_segment(limb: Limb, measured: Collection[str]) -> str:
 def check_person_arms(
     robot: Robot, segments: Collection[str], points: Collection[str] | None = None, table: BodyTable | None = None
 ) -> None:
-    """Raise `BadData` where an arm that the robot follows is not measured, with the advice what to do.
-
-    Parameters
-    ----------
-    segments, points : that are measured, and known; None: all points
-    table : of the person's body; None: the upper body
-    """
+    """Raise `BadData` where an arm that the robot follows is not among the segments and points (None: all)."""
     table, missing = table or load_table(), {}
     for side in (arm.side for arm in robot.arms):
         limb = find_person_arm(table, side)
@@ -187,15 +175,9 @@ def compute_arm_targets(
     scale: float | None = None,
     smoothing_hz: float = SMOOTHING_HZ,
 ) -> ArmTargets:
-    """Targets of the robot's hands for a person's pose, by `map_arm`.
+    """Compute targets of the robot's hands for a person's pose, by `map_arm`; parameters as those of `retarget`.
 
     NaN, gaps and jumps are bridged and count as poor tracking.
-
-    Parameters
-    ----------
-    table : of the person's body; None: the upper body
-    scale : metres of the robot for one of the person; None: a straight arm becomes `compute_target_reach`
-    smoothing_hz : cut-off of the zero-phase low-pass; 0: none
 
     Raises
     ------

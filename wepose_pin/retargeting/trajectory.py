@@ -35,7 +35,6 @@ from .robot import LimitMargins, Robot, load_robot
 from .targets import SMOOTHING_HZ, ArmTargets, HandPath, compute_arm_targets, compute_swivel
 
 RATE_HZ = 100.0
-MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 2000.0
 PLAN_STEP_S = 0.01  # [s] of the first run at least, whatever the rate of the trajectory: coarser, the robot shakes
 WIDE_LIMIT_FACTOR = 8.0  # on the limits of the first run
 MAX_SLOWDOWN = 6.0  # largest time scaling of a sample; the robot lags behind a motion that needs more
@@ -146,34 +145,21 @@ def retarget(
 
     Parameters
     ----------
-    pose : Pose, TrackResult, str or Path
-        What `track` or `load_result` gives, or its `pose`; or a result folder.
-    robot : Robot, str or Path
-        A name such as "panda", a URDF with a map beside it, or the map; or what `wepose_pin.retargeting.load_robot`
-        gives, with its own arms and margins.
-    arm : str, optional
-        Only this arm of the robot, "left" or "right", or "both"; None: all that it has.
-    task : str
-        Follow the "position" of the hands, their "orientation", or "both".
-    rate_hz : float
-        Samples a second of the trajectory, 10 to 2000 Hz.
-    scale : float, optional
-        Factor on the way from shoulder to hand; None: the reach of the robot's arm over the length of the person's.
-    smoothing_hz : float
-        Cut-off frequency of the person's motion; 0: not filtered.
-    speed_scale : float, optional
-        Share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1; None: 0.9.
-    limit_margin : float, optional
-        Distance [rad] kept from the position limits; of a joint that slides a tenth of it in metres; None: 0.05.
-    interval, phase : optional
-        Follow only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
-        "NAME:2" is the second.
-    params : ControllerParams, optional
-        Weights and gains of the controller; None: the default ones.
-    table : BodyTable, optional
-        Of the person's body; None: that of `pose`, where it has a body, else the upper body's.
-    progress : callable, optional
-        Called with the current stage (`STAGES`) and the fraction of it that is done.
+    pose : what `track` or `load_result` gives, or its `pose`; or a result folder
+    robot : a name such as "panda", a URDF with a map beside it, or the map; or what `wepose_pin.retargeting.load_robot`
+        gives, with its own arms and margins
+    arm : only this arm of the robot, "left" or "right", or "both"; None: all that it has
+    task : follow the "position" of the hands, their "orientation", or "both"
+    rate_hz : samples a second of the trajectory, 10 to 2000 Hz
+    scale : factor on the way from shoulder to hand; None: the reach of the robot's arm over the length of the person's
+    smoothing_hz : cut-off frequency of the person's motion; 0: not filtered
+    speed_scale : share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1; None: 0.9
+    limit_margin : distance [rad] kept from the position limits; of a joint that slides a tenth of it [m]; None: 0.05
+    interval, phase : follow only this interval, from and to [s], or this phase of the recording; of a phase with
+        several intervals "NAME:2" is the second
+    params : weights and gains of the controller; None: the default ones
+    table : of the person's body; None: that of `pose`, where it has a body, else the upper body's
+    progress : called with the current stage (`STAGES`) and the fraction of it that is done
 
     Returns
     -------
@@ -269,8 +255,8 @@ def _compute_trajectory(
 
 def check_rate(rate_hz: float) -> None:
     """Raise `WrongOption` for a rate out of range."""
-    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
-        raise WrongOption("rate-hz", f"{rate_hz:g}", f"from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} samples a second")
+    if not 10.0 <= rate_hz <= 2000.0:
+        raise WrongOption("rate-hz", f"{rate_hz:g}", "from 10 to 2000 samples a second")
 
 
 def _run_controller(
@@ -280,12 +266,9 @@ def _run_controller(
     settle: int | None,
     progress: Callable[[float], None],
 ) -> ControllerRun:
-    """Follow the hands from rest.
+    """Follow the hands from rest, and `posture` (n, joints) where they leave joints free; None: the rest posture.
 
-    Parameters
-    ----------
-    posture : (n, joints) reference of the posture; None: the rest posture
-    settle : sample from which on the robot comes to rest as soon as it has settled; None: it does not
+    From the sample `settle` on the robot comes to rest as soon as it has settled; None: it does not.
     """
     robot, n, dt = controller.robot, len(hands[0].weight), controller.dt
     state, states, poses, reports = JointState.at_rest(robot.rest), [], [], []

@@ -137,10 +137,7 @@ class ArmTasks(Activity):
         return _Move(posture, rng.uniform(1.0, 2.5), rng.exponential(3.0))
 
     def _draw_arm(self, rng: np.random.Generator, side: str) -> _Path:
-        """Draw the path of an arm, from the start pose and back to it.
-
-        Values: rotation vector of the elevation about x and y of the torso, twist, elbow flexion, pronation [rad].
-        """
+        """Draw the path of an arm: elevation about x and y of the torso, twist, elbow flexion, pronation [rad]."""
         y, pose = SIDES[side], self.flaws.start_pose
 
         def draw(before: np.ndarray) -> _Move:

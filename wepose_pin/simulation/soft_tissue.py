@@ -134,15 +134,11 @@ class SoftTissue:
         return turn
 
     def __call__(self, t: np.ndarray, moving_time: np.ndarray, pose: BodyPose, accel_L: np.ndarray) -> np.ndarray:
-        """Return rotation vectors (n, 3) [rad] in L.
+        """Return rotation vectors (n, 3) [rad] in L at the times `t` (n,) [s].
 
-        Parameters
-        ----------
-        t : (n,) [s]
-        moving_time : (n,) [s] that the segment has moved; the random part stands where the segment does
-        pose : at `t`, of the torso and what carries the sensor, of the torso's sensor of both arms
-        accel_L : (n, 3) [m/s^2] of the sensor, in L. Limbs move below 5 Hz: the low-pass of a strap at 15 Hz, which
-            the literature gives, would change nothing
+        The random part stands where the segment does: `moving_time` (n,) [s] is how long it has moved. `pose` at `t` is
+        of the torso and what carries the sensor, of the torso's sensor of both arms. Limbs move below 5 Hz: the
+        low-pass of a strap at 15 Hz, which the literature gives, would change nothing of `accel_L` (n, 3) [m/s^2].
         """
         sizes, turn = self.sizes, np.zeros((len(t), 3))
         if sizes.tissue_random:

@@ -126,10 +126,9 @@ class Simulation:
 def _sample_sensor(
     motion: BodyMotion, segment: str, R_LS: Rotation, tissue: SoftTissue, t: np.ndarray, poses: Sequence[BodyPose] = ()
 ) -> tuple[Rotation, np.ndarray, np.ndarray]:
-    """Sample a sensor on its segment at the times `t` (n,) [s], without errors of its own.
+    """Sample a sensor on its segment at the times `t` (n,) [s], without errors of its own; `poses`: of `_sample_poses`.
 
-    Its orientations (n) in W, specific force (n, 3) [m/s^2] in S, and the soft tissue's rotation vectors (n, 3) [rad]
-    in L. `poses`: of `_sample_poses` at these times, where there are some.
+    Its orientations (n) in W, specific force (n, 3) [m/s^2] in S, and the soft tissue's rotation vectors (n, 3) [rad].
     """
     pose, *around = poses or _sample_poses(motion, t, [segment])
     p_W, *others_W = (
@@ -170,22 +169,17 @@ def simulate(
 
     Parameters
     ----------
-    lengths : mapping
-        Length → [m]: ``trunk``, ``shoulder_width``, ``left_upper_arm``, ``left_forearm``, ``left_hand`` and the same of
-        the right.
-    seed : int
-        The same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of their
-        own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
-    noise : ImuNoise
-        Of gyroscope and accelerometer; by default that of an Xsens MTi-3, `NOISE_FREE` for none. It and the names in
-        capitals below are in `wepose_pin.simulation`.
-    imperfections : Imperfections
-        Of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject, `PEOPLE_PRESET`
-        for the sizes that the literature reports.
-    clasp_s : float
-        [s] duration of the clasp, at least 5.
-    protocol : str
-        What the person does in the time of the clasp: "clasp", "t_pose", "bow", or several of them joined by "+".
+    lengths : length → [m]: ``trunk``, ``shoulder_width``, ``left_upper_arm``, ``left_forearm``, ``left_hand`` and the
+        same of the right
+    seed : the same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of
+        their own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as
+        large
+    noise : of gyroscope and accelerometer; by default that of an Xsens MTi-3, `NOISE_FREE` for none. It and the names
+        in capitals below are in `wepose_pin.simulation`
+    imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject,
+        `PEOPLE_PRESET` for the sizes that the literature reports
+    clasp_s : [s] duration of the clasp, at least 5
+    protocol : what the person does in the time of the clasp: "clasp", "t_pose", "bow", or several joined by "+"
 
     Returns
     -------
