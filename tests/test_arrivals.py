@@ -116,16 +116,6 @@ def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
     assert synchronizer.counts[:, FROZEN].sum() == 0
 
 
-def test_a_coarse_sensor_that_comes_to_rest_is_measured() -> None:
-    """Digits of twenty times the noise: in motion hardly a sample repeats, at rest all of them do."""
-    rng, time = np.random.default_rng(0), np.arange(3000) / RATE
-    motion = (np.sin(2.0 * np.pi * time) * (time < 5.0))[None, :, None] * [3.0, 2.7, 2.4]
-    gyro, accel = (np.round((motion + 0.003 * rng.standard_normal((3, 3000, 3))) / 0.06) for _ in range(2))
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    assert np.isfinite(fed(synchronizer, in_order(gyro, accel)).gyro_S).all()
-    assert synchronizer.counts[:, FROZEN].sum() == 0
-
-
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_a_sensor_that_never_changes_is_frozen_where_another_one_is_noisy(noise: float) -> None:
     gyro, accel = (noise * values for values in signals(600))

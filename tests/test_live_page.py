@@ -271,14 +271,8 @@ async def taken(connection: WebSocketClientConnection) -> Any:
 
 def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
     own = page.url.rstrip("/")
-    https = own.replace("http", "https")
-    for origin, code in (
-        (own, 101),
-        ("http://evil.example", 403),
-        ("null", 403),
-        (https, 403),
-        ("http://localhost", 403),
-    ):
+    foreign = ("http://evil.example", "null", own.replace("http", "https"), "http://localhost")
+    for origin, code in ((own, 101), *((each, 403) for each in foreign)):
         connection = http.client.HTTPConnection(own.removeprefix("http://"), timeout=60)
         upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
         connection.request("GET", "/stream", headers=upgrade | {"Sec-WebSocket-Key": "A" * 22 + "==", "Origin": origin})

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ..body import BodyModel
     from ..live import Output, SensorSetup, SessionSummary
     from ..live.page import LivePage
-    from ..live.robot import RobotOutput, RobotSummary
+    from ..live.robot import RobotOutput
     from ..live.sources.base import Source
 
 GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
@@ -52,7 +52,7 @@ class Live(NamedTuple):
     """What came of `live`."""
 
     session: SessionSummary | None  # None: the guided session was ended before tracking
-    robot: RobotSummary | None
+    robot: RobotOutput | None
 
 
 def live(
@@ -244,7 +244,7 @@ def live(
     finally:
         for each in outputs:
             each.close()
-    ended = Live(summary, None if driven is None else driven.summary())
+    ended = Live(summary, driven)
     _print_end(ended, record)
     return ended
 
@@ -267,13 +267,13 @@ def _print_end(ended: Live, record: Path | None) -> None:
     keys = ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
     print_table(title, titles, [(name, *(str(each[key]) for key in keys)) for name, each in session.counts.items()])
     if robot is not None:
-        title = f"{robot.robot}: {robot.commands} commands, none with a pose"
-        if robot.share:
-            shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
-            title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}"
+        posed = robot.states.total()
+        shares = ", ".join(f"{100.0 * count / posed:.1f} % {state}" for state, count in robot.states.most_common())
+        title = f"{robot.robot.map.name}: {0 if robot.newest is None else robot.newest.number + 1} commands"
+        title += f"; with a pose {shares}" if posed else ", none with a pose"
         rows = [
-            (side, *(f"{1e3 * np.quantile(error, share):.1f}" if len(error) else "–" for share in (0.5, 0.9)))
-            for side, error in robot.error.items()
+            (side, *(f"{1e3 * np.quantile(error, share):.1f}" if error else "–" for share in (0.5, 0.9)))
+            for side, error in robot.errors.items()
         ]
         print_table(title, ("arm", "hand off its target [mm]", "in 90 % under"), rows)
         print_diagnostics(robot.diagnostics)

@@ -7,10 +7,9 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,16 +35,6 @@ CLOCK_JUMP_S = 0.25  # [s] of that offset, from which on the clock is a new one
 PATIENCE_S = 10.0  # [s] for which the end waits until the robot is at rest
 
 
-class RobotSummary(NamedTuple):
-    """Outcome of a robot's session."""
-
-    robot: str
-    commands: int
-    share: Mapping[str, float]  # state → share of the commands that had a pose
-    error: Mapping[str, np.ndarray]  # side → (n,) [m] of the hand while it followed, of the newest commands
-    diagnostics: tuple[Diagnostic, ...]  # lost commands, stops to stay clear of itself, hands that stuck
-
-
 class RobotOutput(Output):
     """Sends the robot's commands, each as JSON in a datagram of its own.
 
@@ -58,6 +47,13 @@ class RobotOutput(Output):
     lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
     speed : of a replay
     table : of the person's body; None: the upper body
+
+    Attributes
+    ----------
+    newest : the newest command; None before the first
+    states : state → number of commands that had a pose
+    skipped : commands that were due while one took too long
+    errors : side → distances [m] of the hand from its target while it followed, of the newest commands
     """
 
     def __init__(
@@ -81,9 +77,9 @@ class RobotOutput(Output):
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
         self.newest: Command | None = None
-        self._states: Counter[str] = Counter()
-        self.skipped = 0  # commands that were due while one took too long
-        self._error: dict[str, deque[float]] = {arm.side: deque(maxlen=MAX_LATENCIES) for arm in self.robot.arms}
+        self.states: Counter[str] = Counter()
+        self.skipped = 0
+        self.errors: dict[str, deque[float]] = {arm.side: deque(maxlen=MAX_LATENCIES) for arm in self.robot.arms}
 
     def open(self) -> None:
         if self._thread is None:
@@ -123,24 +119,17 @@ class RobotOutput(Output):
         """(n,) [rad or m] of the newest command; None before the first."""
         return None if self.newest is None else self.newest.u
 
-    def summary(self) -> RobotSummary:
-        name, posed, stuck = self.robot.map.name, sum(self._states.values()), self.stream.stuck
-        diagnostics = (
+    @property
+    def diagnostics(self) -> list[Diagnostic]:
+        """Commands that did not reach the robot, steps in which it braked to stay clear of itself, hands that stuck."""
+        name, stuck = self.robot.map.name, self.stream.stuck.items()
+        diagnostics = [
             Diagnostic("robot-commands-lost", WARNING, name, self.skipped),
             Diagnostic("robot-stopped-for-clearance", WARNING, name, self.stream.stopping),
             Diagnostic("robot-commands-lost", WARNING, name, self._sender.dropped, facts={"variant": "unsent"}),
-            *(
-                Diagnostic("robot-hand-off-target", WARNING, s, m, STUCK_M, {"variant": "live"})
-                for s, m in stuck.items()
-            ),
-        )
-        return RobotSummary(
-            name,
-            0 if self.newest is None else self.newest.number + 1,
-            {state: count / posed for state, count in self._states.most_common()},
-            {side: np.array(error) for side, error in self._error.items()},
-            tuple(diagnostic for diagnostic in diagnostics if diagnostic.value),
-        )
+            *(Diagnostic("robot-hand-off-target", WARNING, s, m, STUCK_M, {"variant": "live"}) for s, m in stuck),
+        ]
+        return [diagnostic for diagnostic in diagnostics if diagnostic.value]
 
     # In the thread ---------------------------------------------------------------------------------------------------
 
@@ -178,10 +167,10 @@ class RobotOutput(Output):
         self.newest = command  # before it is sent: who hears of a command finds it described here
         self._sender.send(command_json(self.robot, command, self._speed))
         if not math.isnan(command.time):
-            self._states[command.state] += 1
+            self.states[command.state] += 1
         if command.state in ("follow", "slow"):
             for arm, error in zip(self.robot.arms, command.error[:, 0].tolist(), strict=True):
-                self._error[arm.side].append(error)
+                self.errors[arm.side].append(error)
         return command
 
 
