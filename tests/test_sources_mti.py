@@ -154,9 +154,7 @@ def test_the_outputs_that_a_device_has_at_a_rate(plugged: Plug) -> None:
     slower = plugged("three", most={0x4020: 100, 0x8020: 100, 0x4040: 1000, 0x8040: 800})
     source = open_source(f"mti:{slower.link}=torso@1000")
     source.open()
-    wait_until(
-        lambda: source.describe_awaited().endswith("it has no 1000 Hz, but 800 Hz: choose a rate that it has, as @800")
-    )
+    wait_until(lambda: source.describe_awaited().endswith("it has no 1000 Hz; it offers 800 Hz: write @800"))
     source.close()
 
 

@@ -181,7 +181,8 @@ class MTiSource(Source):
             if offers[-1] == self._hz:
                 self._ask(port, buffer, GO_TO_MEASUREMENT)
                 return
-        raise OSError(f"it has no {self._hz} Hz, but {max(offers)} Hz: choose a rate that it has, as @{max(offers)}")
+        best = max(offers)
+        raise OSError(f"it has no {self._hz} Hz" + (f"; it offers {best} Hz: write @{best}" if best else ""))
 
     def _ask(self, port: Any, buffer: bytearray, mid: int, data: bytes = b"") -> Frame:
         for _ in range(TRIES):
