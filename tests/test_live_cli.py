@@ -48,7 +48,7 @@ def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_pa
     file = tmp_path / "a.mcap"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         listening.bind(("127.0.0.1", 0))
-        listening.settimeout(120.0)
+        listening.settimeout(600.0)  # a new clone compiles first
         command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"replay:{session}", "--no-page"]
         command += ["--record", str(file), "--speed", str(SPEED), "--udp", str(listening.getsockname()[1])]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

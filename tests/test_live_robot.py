@@ -300,7 +300,7 @@ class Receiver(threading.Thread):
 
     def until(self, happens: Callable[[dict[str, Any]], bool], meanwhile: Callable[[], None] = lambda: None) -> int:
         """Wait until such a message comes, after all that have come; return its row."""
-        row, end = len(self.messages), time.monotonic() + 120.0
+        row, end = len(self.messages), time.monotonic() + 600.0  # a new clone compiles first
         while True:
             if row < len(self.messages):
                 if happens(self.messages[row]):

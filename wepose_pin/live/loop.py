@@ -90,6 +90,7 @@ class LiveLoop(Stage):
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
         self._soft_tissue = SoftTissueCorrection(self.model.table, self.model.tissue_means, tuple(source.sensors))
+        self._soft_tissue.correct(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
         self._monitor, self._stream = SensorMonitor(source), TickStream(source, begin, log)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
         self._estimator: SegmentEstimator | None = None  # from when the start pose is found
