@@ -126,14 +126,11 @@ def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     assert alone.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
     assert not alone.problem.scale_lengths
     assert alone.subject.note.endswith("of the population prior")
-    measured = calibrate(recording, prior=person.prior, measured={"trunk": 0.5, "shoulder_width": 0.33})
-    assert measured.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (4, 6))])
-def test_hands_that_hardly_move_leave_the_headings_open(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hands_that_hardly_move_leave_the_headings_open(monkeypatch: pytest.MonkeyPatch) -> None:
     """The closure has several minima then: ± 2.4 deg of one of them was stated at 118 deg off."""
-    scale = 0.05
+    scale, seed = 0.05, 1
     point, wander = Motion._clasp_point, Wander.__call__
     monkeypatch.setattr(Motion, "_clasp_point", lambda self, t, moving: point(self, t, scale * moving))
     monkeypatch.setattr(Motion, "lean_deg", scale * Motion.lean_deg)

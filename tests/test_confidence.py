@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -21,7 +20,7 @@ from wepose_pin.body.links import compute_axis_std, compute_point_covariances
 from wepose_pin.body.subject import girdle_rows, population_subject
 from wepose_pin.simulation import MTI_3, simulate, simulate_person
 from wepose_pin.tracking import track
-from wepose_pin.tracking.measures import PERIOD_S, compute_error_budget, group_by_source
+from wepose_pin.tracking.measures import PERIOD_S, compute_error_budget
 from wepose_pin.writers import write_session
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]
@@ -144,22 +143,3 @@ def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:
     assert "lengths" not in parts
     leaving = np.sqrt(np.mean(np.square(TABLE.girdles["right_shoulder"].residual_std)))
     assert parts["shoulder girdle"] == pytest.approx(leaving, rel=1e-9)  # what leaves the law is nobody's parameter
-
-
-def test_the_command_prints_the_error_budget(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    simulation = simulate(simulate_person(1).lengths, seed=1, clasp_s=5.0, circles=1)
-    write_session(tmp_path, simulation.recording())
-    printed = {}
-    for name, *switch in (("with", "--error-budget"), ("without",), ("ncf", "--error-budget", "--method", "ncf")):
-        assert run("track", tmp_path, "-o", tmp_path / name, *switch, "--no-view", "--no-report") == 0
-        printed[name] = capsys.readouterr().out
-    assert "What the ± is made of" not in printed["without"]
-    assert "the filter states no uncertainty" in printed["ncf"].replace("\n", " ")
-    table = printed["with"].partition("What the ± is made of")[2]
-    summary = json.loads((tmp_path / "without" / "summary.json").read_text())["error_budget_mm"]
-    assert set(summary) == set(simulation.points)
-    for point, parts in summary.items():
-        (line,) = (line for line in table.splitlines() if line.strip().startswith(point.replace("_", " ")))
-        *sources, total = (float(word) for word in line.split()[2:])
-        assert [*sources, total] == pytest.approx(list(group_by_source(parts).values()), abs=0.6)  # whole mm
-        assert len(sources) == 4

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import compute_pose
 from wepose_pin.body.mounts import StartPose
-from wepose_pin.observations.closures import PointPair
 from wepose_pin.observations.hinges import HingePlane, linearize_hinge
 from wepose_pin.observations.joint_accelerations import find_joint_pairs, linearize_joint
+from wepose_pin.observations.paths import PointPair
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:

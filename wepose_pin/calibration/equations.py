@@ -38,11 +38,10 @@ from ..body import BodyTable
 from ..body.girdle import PARAMETERS
 from ..body.soft_tissue import LEAST_TWIST_COSINE
 from ..body.table import Vector
-from ..observations.directions import Level, Pointing
 from ..observations.hinges import HingePlane
 from ..observations.paths import BodySymbols, GirdleTerm, express_covariance, express_path
 from ..observations.symbols import about_z, product, rotate_back, small_rotation
-from .conditions import Constraint, Loop
+from .conditions import Constraint, Level, Loop, Pointing
 from .protocols import FreeMotion
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals

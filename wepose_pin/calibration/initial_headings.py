@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.lengths import UNIVERSE
-from ..observations.directions import Level, Pointing
-from .conditions import Loop
+from .conditions import Level, Loop, Pointing
 from .couplings import Coupling
 from .least_squares import Observations
 

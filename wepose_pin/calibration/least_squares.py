@@ -14,8 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ..errors import NoSolution
-from ..observations.directions import Level, Pointing
-from .conditions import Constraint, Loop
+from .conditions import Constraint, Level, Loop, Pointing
 from .equations import GAP_ROWS, Layout, sample_functions
 
 MIN_LENGTH = 0.01  # [m] below which a length has not converged

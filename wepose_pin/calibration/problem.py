@@ -23,12 +23,11 @@ from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
-from ..observations.directions import Pointing
 from ..observations.hinges import find_hinges
 from ..observations.joint_accelerations import find_neighbours
 from ..observations.paths import find_girdles
 from ..recording import Intervals, Recording, format_span
-from .conditions import Constraint, Loop, group_lengths, resolve_conditions
+from .conditions import Constraint, Loop, Pointing, group_lengths, resolve_conditions
 from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations

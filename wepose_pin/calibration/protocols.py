@@ -26,7 +26,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..assets import asset
-from ..body import BodyTable, list_breadths
+from ..body import BodyTable
 from ..body.mounts import PALM_SLIP_STD
 from ..body.table import check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
@@ -96,14 +96,9 @@ class Axis(NamedTuple):
 
 
 class FreeMotion(NamedTuple):
-    """Limbs move freely.
+    """Limbs move freely."""
 
-    Parameters
-    ----------
-    phase : of the session; empty: from the start pose on
-    """
-
-    phase: str
+    phase: str  # of the session; empty: from the start pose on
 
 
 class _Pose(NamedTuple):
@@ -148,16 +143,10 @@ class Protocol:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
         check_segments(table, (*named, *self.needs), where, BadOption)
-        measured = self.measured_example.partition("=")[0]
-        if measured and measured not in (*table.lengths, *list_breadths(table)):
-            raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 
 def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:
-    """The protocol of a recording with these phases where none is named: `DEFAULT`, with those of `ALSO` that it has.
-
-    The paper's formulation takes no poses.
-    """
+    """The protocol where none is named: `DEFAULT`, with those of `ALSO` that are phases; the paper takes no poses."""
     return "+".join([DEFAULT, *(name for name in ALSO if name in phases and formulation == "full")])
 
 

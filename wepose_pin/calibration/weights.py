@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..observations.directions import Level, Pointing
-from .conditions import Loop
+from .conditions import Level, Loop, Pointing
 from .couplings import LEAST_CORRELATION_S
 from .equations import GAP_ROWS, HINGE_STD, Layout
 from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve

@@ -33,7 +33,6 @@ def track(
     force: Force = False,
     accept_failed: Annotated[AcceptFailed, MORE] = False,
     covariance: Annotated[bool, MORE] = False,
-    error_budget: Annotated[bool, MORE] = False,
     torques: Annotated[bool, MORE] = False,
     causal: Annotated[bool, RESEARCH] = False,
     open_loop: Annotated[bool, RESEARCH] = False,
@@ -72,10 +71,6 @@ def track(
         Write report.html, which shows diagnostics and what to do about them, noise, drift, hands and joint angles.
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
-    error_budget
-        Print the contribution of each source of error to the standard deviation of each point: soft tissue, sensors
-        with their mounts and start poses, lengths, the shoulder girdle. summary.json and report.html have it in any
-        case.
     torques
         Write torques.parquet too: joint torques by inverse dynamics. Assumed are a fixed base, gravity as the only
         external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
@@ -139,14 +134,6 @@ def track(
             failures = write_track_pages(out, summary, view=view, report=report, fps=view_rate_hz or 30.0)
     content = summary.content
     _print_summary(content)
-    if error_budget:
-        from ..report.track import tabulate_error_budget
-
-        tables = tabulate_error_budget(summary.measures.error_budget)
-        for table in tables:
-            print_table(*table)
-        if not tables:
-            say("Error budget: none, since the filter states no uncertainty, or no point of a person is known")
     print_diagnostics(failures)
     motion = "Motion" + (f", {view_rate_hz:.2g} frames a second" if view_rate_hz else "")
     say_pages(out, ({"Report": "report.html"} if report else {}) | ({motion: "view.html"} if view else {}))

@@ -23,9 +23,9 @@ import numpy as np
 from scipy.special import expit, logit
 
 from ..body.mounts import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
-from ..observations.closures import GapRows
 from ..observations.hinges import linearize_hinge
 from ..observations.joint_accelerations import JointResidual, linearize_joint
+from ..observations.paths import GapRows
 from .heading_problem import FilterHeadings, HeadingProblem, Knot
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption

@@ -7,13 +7,10 @@ Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is correct
 
 from __future__ import annotations
 
-import contextlib
-import tempfile
-import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -124,8 +121,7 @@ class HeadingCorrector:
     """Corrects headings as samples come, or by `smooth` after the last one.
 
     Causally a complete knot is solved in parts, with samples between, so that no pose waits for long. From the sample
-    `lead` of the next knot on, by which all parts are done, the correction fades in. Offline nothing is corrected yet;
-    what the way back needs of each knot is in a temporary file: of a day it is gigabytes.
+    `lead` of the next knot on, by which all parts are done, the correction fades in. Offline nothing is corrected yet.
 
     Parameters
     ----------
@@ -156,11 +152,8 @@ class HeadingCorrector:
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot that is solved
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
-        self._history: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # of knots, as `HeadingCorrection` has it
-        self._file: IO[bytes] | None = None
-        if not problem.causal:
-            self._file = tempfile.TemporaryFile()  # noqa: SIM115  it lasts as long as this object
-            weakref.finalize(self, _close, self._file)
+        self._history: list[HeadingEstimate] = []  # causally, of the knots
+        self._states: list[tuple[np.ndarray, np.ndarray, Process]] = []  # offline: x, P, and what led to them
         self._update_estimate()
         self._update_variance()
 
@@ -223,9 +216,8 @@ class HeadingCorrector:
         knot = Knot(quat_WL, sides, filters, lost, clasped)
         yield
         yield from self._filter.step(knot)
-        if self._file is not None:
-            x, P, process = self._filter.x, self._filter.P, self._filter.process
-            self._file.write(np.concatenate([x, P.ravel(), *process]).tobytes())
+        if not problem.causal:
+            self._states.append((self._filter.x, self._filter.P, self._filter.process))
             self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / problem.sensor_rate_hz)
             return
         self._update_estimate()
@@ -238,7 +230,7 @@ class HeadingCorrector:
         for _ in self._solving:
             pass
         self._solving = None
-        if self._file is not None:
+        if not self.problem.causal:
             return
         self._from, self._to = self._to, self._estimate.errors.copy()
         measured = self.problem.measured
@@ -247,7 +239,7 @@ class HeadingCorrector:
             self._to[measured] *= self._corrects_measured
         if self._records:
             self._times.append(self._knot_end)
-            self._history.append((self._to, *self._estimate[1:]))
+            self._history.append(self._estimate._replace(errors=self._to))
         self._update_variance()
 
     def reset(self, heading_offset: np.ndarray) -> None:
@@ -271,13 +263,13 @@ class HeadingCorrector:
 
     def collect(self) -> HeadingCorrection:
         """Return what was observed and corrected causally so far."""
-        k, history = len(self.problem.names), self._history
+        k = len(self.problem.names)
         return HeadingCorrection(
             self.problem,
             np.array(self._times),
-            np.array([errors for errors, _, _ in history]).reshape(-1, k),
-            np.array([cov for _, cov, _ in history]).reshape(-1, k, k),
-            np.array([cov for _, _, cov in history]).reshape(-1, k, k),
+            np.array([each.errors for each in self._history]).reshape(-1, k),
+            np.array([each.covariance for each in self._history]).reshape(-1, k, k),
+            np.array([each.segment_covariance for each in self._history]).reshape(-1, k, k),
         )
 
     def smooth(self, filters: FilterHeadings, end: float) -> HeadingCorrection | None:
@@ -290,11 +282,10 @@ class HeadingCorrector:
             self.close(filters, end=end)
         if not self._times:
             return None
-        x, P, process = self._read(len(self._times) - 1)
+        x, P, process = self._states[-1]
         care = find_care(problem, x, P)
         estimates = [estimate_headings(problem, x, P, care)]
-        for i in range(len(self._times) - 2, -1, -1):
-            before_x, before_P, process_before = self._read(i)
+        for before_x, before_P, process_before in self._states[-2::-1]:
             forward.x, forward.P = before_x, before_P
             forward.predict(process)
             gain = np.linalg.solve(forward.P, forward.advance(before_P)).T
@@ -306,21 +297,6 @@ class HeadingCorrector:
         if problem.measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
             smoothed.errors[:, problem.measured] = 0.0
         return HeadingCorrection(problem, np.array(self._times), *smoothed)
-
-    def _read(self, i: int) -> tuple[np.ndarray, np.ndarray, Process]:
-        """Read the state and its covariance after knot i, and the process that led to it."""
-        assert self._file is not None
-        n = self.problem.columns.size
-        size = n * (n + 3)
-        self._file.seek(8 * size * i)
-        x, P, *process = np.split(np.fromfile(self._file, count=size), np.cumsum([n, n * n, n]))
-        return x, P.reshape(n, n), Process(*process)
-
-
-def _close(file: IO[bytes]) -> None:
-    """Close a temporary file; what a full disk has not taken is of no use any more."""
-    with contextlib.suppress(OSError):
-        file.close()
 
 
 def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:

@@ -296,20 +296,11 @@ class SegmentEstimator:
             self.headings.reset(self._heading_offset)
             self._variance = self.headings.variance
 
-    def _find_start_var(self, name: str) -> float:
-        return compute_start_heading_var(self._first, name, self._subject, self._start_pose)
-
-    def covariance(self) -> np.ndarray:
-        """Return the covariances (k, 3, 3) [rad²] of the segments in W after the last step, mounts included.
-
-        NaN where the filter has none.
-        """
-        return [covariance for covariance in self.covariance_gradually() if covariance is not None][-1]
-
     def covariance_gradually(self) -> Iterator[np.ndarray | None]:
-        """Do as `covariance`, in parts of less than half a millisecond; only the last one is not None.
+        """Compute the covariances (k, 3, 3) [rad²] of the segments in W after the last step; NaN where there is none.
 
-        There may be steps between the parts: the result is that of the step before the first one.
+        It does so in parts of less than half a millisecond; only the last one is not None. There may be steps between
+        the parts: the result is that of the step before the first one.
         """
         output, offset, variance = self._read_filters(), self._heading_offset.copy(), np.array(self._variance)
         lost_s, covariance = self._lost / self.rate_hz, np.full((len(self.names), 3, 3), np.nan)
@@ -364,7 +355,8 @@ class SegmentEstimator:
         )
         if np.isnan(variance).any():
             return cov
-        return correct_covariance(cov, (quat_VS, attitude_cov), offset, self._find_start_var(name), variance)
+        start_var = compute_start_heading_var(self._first, name, self._subject, self._start_pose)
+        return correct_covariance(cov, (quat_VS, attitude_cov), offset, start_var, variance)
 
     def _order_recent(self) -> np.ndarray:
         return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
