@@ -93,12 +93,7 @@ def _read_hints(function: Any) -> dict[str, Any]:
 def check_arguments(function: Any, arguments: Mapping[str, Any]) -> None:
     """Check every argument against the annotation of its name in a function, or in the constructor of a class.
 
-    Raises
-    ------
-    BadOption
-        An argument does not fit; the text has its name, its value and what is needed.
-    WeposeError
-        An argument's own `check` fails.
+    Raise `BadOption` where one does not fit, or what its own `check` raises.
     """
     for name, hint in _read_hints(getattr(function, "__init__") if isinstance(function, type) else function).items():  # noqa: B009
         if name in arguments:
@@ -144,13 +139,7 @@ def _show(value: Any) -> str:
 
 
 def check_array(place: str, values: Any, shape: tuple[int, ...], kinds: str = "fiu", rows: str = "") -> None:
-    """Check that `values` is an array of that shape with a type of NumPy's `kinds`; `rows` ends the error's text.
-
-    Raises
-    ------
-    BadData
-        It is not.
-    """
+    """Raise `BadData` where `values` is no array of that shape with a type of NumPy's `kinds`; `rows` ends the text."""
     if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
         kind = "bool" if kinds == "b" else "real numbers"
         raise BadData(f"{place} = {_show(values)}: a NumPy array of {kind}, {shape}, is needed")
