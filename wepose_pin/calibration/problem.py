@@ -112,8 +112,7 @@ class CalibrationProblem:
         names = [name for name in self.lengths_in_closures if name not in self.measured]
         if not names or (self.protocol.measured_example and not self.measured):
             return self.protocol.measured_example
-        longest = max(names, key=self.model.lengths.__getitem__)
-        return f"{longest}={self.model.lengths[longest]:.3f}"
+        return f"{max(names, key=self.model.lengths.__getitem__)}=METRES"
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:
