@@ -174,11 +174,13 @@ def simulate(
     seed : the same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of
         their own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as
         large
+    rate_hz : samples a second
     noise : of gyroscope and accelerometer; by default that of an Xsens MTi-3, `NOISE_FREE` for none. It and the names
         in capitals below are in `wepose_pin.simulation`
     imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject,
         `PEOPLE_PRESET` for the sizes that the literature reports
     clasp_s : [s] duration of the clasp, at least 5
+    circles : number of circles, 0 or more
     protocol : what the person does in the time of the clasp: "clasp", "t_pose", "bow", or several joined by "+"
 
     Returns
