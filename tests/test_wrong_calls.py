@@ -257,9 +257,10 @@ def test_the_name_that_is_meant_may_differ_in_case_and_hyphens() -> None:
 
 def test_a_pose_or_a_truth_of_nan_is_refused() -> None:
     pose = right()["evaluate"]["pose"]
-    unknown = replace(pose, quat_WL={name: np.full_like(quat, NAN) for name, quat in pose.quat_WL.items()})
+    quats, points = ({n: np.full_like(v, NAN) for n, v in each.items()} for each in (pose.quat_WL, pose.points))
+    unknown = replace(pose, quat_WL=quats, points=points)
     with pytest.raises(BadData, match="NaN in all samples"):
         wp.joint_angles(unknown)
     for pair in ((pose, unknown), (unknown, pose)):
-        with pytest.raises(BadData, match=r"no orientation of a segment .* NaN"):
+        with pytest.raises(BadData, match="no point in common, or one of the two is NaN"):
             wp.evaluate(*pair)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import check_arguments
+from ..arguments import check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
@@ -142,7 +142,8 @@ def estimate_orientation(
     """
     check_arguments(estimate_orientation, locals())
     check_method(method)
-    check_arguments(METHODS[method], {"params": params})
+    kind = METHODS[method].params_type
+    check_value("params", params, kind | None if kind else type(None))
     try:
         gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
     except (TypeError, ValueError) as error:
