@@ -94,16 +94,6 @@ def test_a_rate_that_is_cut_off_is_not_known(digits: float) -> None:
     assert not ticks.lost.any()
 
 
-def test_larger_rates_tell_that_it_was_no_range() -> None:
-    gyro, accel = signals(400)
-    gyro *= 0.1
-    gyro[1, 200:210, 0] = 3.0
-    gyro[1, 300, 0] = 3.01
-    gyro[1, 350:354, 0] = 3.0
-    known = np.isfinite(fed(StreamSynchronizer(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all(axis=2).T
-    assert np.flatnonzero(~known[1]).tolist() == list(range(204, 210))
-
-
 @pytest.mark.parametrize("digit", [0.5, 1.0])
 def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
     """Noise of half a digit or less, at rest, then now and then in motion: it stays the same for a while by chance."""
@@ -166,22 +156,3 @@ def test_a_faster_sensor_is_averaged_over_the_step() -> None:
     ticks = fed(StreamSynchronizer(NAMES[:1], RATE, BEGIN), rows)
     means = rate[1 : 4 * ((n - 1) // 4) + 1].reshape(-1, 4, 3).mean(axis=1)
     np.testing.assert_allclose(ticks.gyro_S[1:, 0], means[: len(ticks.time) - 1], atol=1e-9)
-
-
-def test_after_a_long_silence_ticks_come_in_pieces() -> None:
-    """So that whoever follows them needs no memory for an hour of them."""
-    zero = np.zeros((1, 3))
-
-    def at(t: float) -> Arrivals:
-        return order_arrivals([Samples(name, np.array([t]), zero, zero) for name in NAMES], NAMES)
-
-    whole, parts = (StreamSynchronizer(NAMES, RATE, BEGIN) for _ in range(2))
-    made = []
-    for t in [tick_time(0), *(tick_time(6000 + k) for k in range(5))]:
-        ticks, pieces = whole.push(at(t)), list(parts.iterate_ticks(at(t)))
-        assert sum(len(piece.time) for piece in pieces) == len(ticks.time)
-        for field in Ticks._fields[1:] if pieces else ():
-            np.testing.assert_array_equal(np.concatenate([getattr(p, field) for p in pieces]), getattr(ticks, field))
-        made += pieces
-    assert max(len(piece.time) for piece in made) < 2000 < 5000 < sum(len(piece.time) for piece in made)
-    assert all(a.first + len(a.time) == b.first for a, b in pairwise(made))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from commands import run
 from reading import text_of
 
-from benchmarks.long_recordings import there_and_back
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import build_pose_table
 from wepose_pin.body.subject import Subject
@@ -88,36 +86,6 @@ def test_chunks_put_together_are_the_whole(made: Simulation, subject: Subject, m
     assert chunks[-1].correction is not None
     assert max(whole.correction.max_correction_deg.values()) > 0.01  # there was something to hold
     assert summarize_chunks(recording, chunks).content == summarize(whole).content
-
-
-def test_saturation_and_gaps_are_those_of_the_whole(made: Simulation, subject: Subject) -> None:
-    """A plateau at the largest value of a chunk is none of the recording; gaps go over edges of chunks."""
-    recording = made.recording()
-    sensors = dict(recording.sensors)
-    for name, (first, last) in {"left_forearm": (14.0, 27.0), "torso": (19.5, 20.3)}.items():
-        sensors[name] = replace(sensors[name], gap=(recording.time >= first) & (recording.time < last))
-    gyro_S = recording.imus["right_forearm"].gyro_S.copy()
-    gyro_S[3600:3620, 0], gyro_S[5400, 0] = 12.0, 20.0
-    sensors["right_forearm"] = replace(sensors["right_forearm"], gyro_S=gyro_S)
-    recording = replace(recording, sensors=sensors)
-    whole = track(recording, subject)
-    chunks = list(track_chunks(recording, subject, chunk_s=6.0))
-    assert joined(chunks).equals(build_pose_table(whole.pose, covariance=True))
-    ours, wanted = summarize_chunks(recording, chunks), summarize(whole)
-    assert ours.content == wanted.content
-    assert not any(each.code == "signal-saturated" for each in wanted.diagnostics)
-    assert wanted.content["sensors"]["torso"]["gaps"] == 1
-
-
-def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation) -> None:
-    recording = made.recording()
-    again = there_and_back(recording, recording.span((0.5, 4.5)))
-    late = (float(again.time[-1]) - 4.5, float(again.time[-1]) - 1.0)
-    again = replace(again, phases={"static": ((0.5, 4.5),), "start": (late,)})
-    whole = track(again)
-    chunks = list(track_chunks(again, chunk_s=3.0))
-    assert chunks[0].time[-1] >= late[1] > chunks[0].time[-1] - 3.0
-    assert joined(chunks).equals(build_pose_table(whole.pose, covariance=True))
 
 
 def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:

@@ -104,17 +104,6 @@ def test_a_full_disk_is_told_with_the_name_of_the_output(number: int, tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_export_that_has_no_room_for_its_record_is_none(result: Path, tmp_path: Path) -> None:
-    """The record of what made it stands beside the file: neither without the other."""
-    from wepose_pin.writers.export import export
-
-    with pytest.raises(ExistingOutput), files_of_at_most(40_000):
-        export(result, tmp_path / "a.urdf", provenance={"format": 1, "long": "x" * 50_000})
-    assert list(tmp_path.iterdir()) == []
-    export(result, tmp_path / "a.urdf", provenance={"format": 1})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.urdf", "a.urdf.provenance.json"]
-
-
 # Places that cannot be written -------------------------------------------------------------------------------------
 
 NOWHERE = [place for place in ("/proc/wepose", "/dev/null", "/dev/null/out") if Path("/proc/self").exists()]
@@ -214,13 +203,6 @@ def test_data_may_lie_where_the_lab_keeps_them(name: str, tmp_path: Path) -> Non
         main(["track", str(session), "--no-report", "-o", str(tmp_path / "out")])
     assert stop.value.code == 0
     assert (tmp_path / "out" / "pose.parquet").is_file()
-
-
-@pytest.mark.parametrize("name", ["a\\u0000b.csv", "x" * 5000 + ".csv", "/etc/passwd", "/proc/self/mem", "."])
-def test_names_of_data_that_are_none(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = Files(tmp_path, good_table())
-    files.say("arm.csv", name)
-    refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
 
 
 # Kills -------------------------------------------------------------------------------------------------------------

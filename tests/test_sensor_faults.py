@@ -14,9 +14,9 @@ from test_bad_input import refused
 
 from benchmarks.trials import read_broad
 from wepose_pin import estimate_orientation, load_session, rotations
-from wepose_pin.diagnostics import Diagnostic, render
+from wepose_pin.diagnostics import Diagnostic
 from wepose_pin.errors import BadData
-from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
+from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.faults import find_faults
 from wepose_pin.recording.plausibility import check_signals
@@ -118,22 +118,6 @@ def cut_off_swing(made: Simulation) -> tuple[Recording, Rotation, float]:
     return with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel), turned, level
 
 
-def test_a_gyroscope_at_its_limit_is_not_taken_for_static(made: Simulation, tmp_path: Path) -> None:
-    """A spin that is cut off for seconds varies less than rest does, and the accelerometer measures more than g."""
-    whole, level = replace(made.recording("spin"), phases={}), 20.0
-    sensor, time = whole.sensors[BROKEN], whole.time
-    up = int(np.argmax(np.abs(sensor.accel_S[100])))
-    swing = np.where((time > 8.0) & (time < 18.0), 2.0 * level * np.sin(2.0 * np.pi * (time - 8.0) / 10.0), 0.0)
-    gyro_S, accel_S = (
-        np.tile(values[50:450], (len(time) // 400 + 1, 1))[: len(time)] for values in (sensor.gyro_S, sensor.accel_S)
-    )
-    gyro_S[:, up] = np.clip(gyro_S[:, up] + swing, -level, level)
-    accel_S[:, (up + 1) % 3] += 0.026 * swing.clip(-level, level) ** 2  # an arm of 26 mm
-    path = written(tmp_path / "in", with_sensor(whole, BROKEN, gyro_S=gyro_S, accel_S=accel_S))
-    (saturated,) = (each for each in load_session(path).diagnostics if each.code == "signal-saturated")
-    assert (saturated.place, saturated.facts["range"]) == (BROKEN, pytest.approx(level))
-
-
 @pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
 @pytest.mark.parametrize("method", ["amekf", "smoother"])
 def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
@@ -225,24 +209,6 @@ def test_a_coarse_sensor_may_stay_the_same(bias_deg: float, moving: bool) -> Non
     assert find_faults({"one": (time, gyro, accel)}) == {}
 
 
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, 1), (0.6, 0.8, 0)])
-@pytest.mark.parametrize(("size", "hertz", "turns"), [(0.8, 1.5, 0.0), (1.2, 0.2, 0.0), (0.0, 1.0, 1.0)])
-@pytest.mark.parametrize("tilt", [0.0, 0.5])
-def test_a_clean_motion_about_one_axis_is_one(
-    axis: tuple[float, ...], size: float, hertz: float, turns: float, tilt: float
-) -> None:
-    """Simulated without noise, on a lever: swung at up to 430 deg/s, slowly, or turned on and on at `turns` [rad/s]."""
-    time = np.arange(2500) / RATE
-    on = np.clip((time - 3.0) / 4.0, 0.0, 1.0)
-    on = on**3 * (10.0 - 15.0 * on + 6.0 * on**2)
-    angle = on * size * np.sin(2.0 * np.pi * hertz * time) + turns * np.cumsum(on) / RATE
-    R, R_SL = Rotation.from_rotvec(angle[:, None] * axis), Rotation.from_rotvec([tilt, 0.0, 0.0])
-    place = R.apply([0.3, 0.2, -0.6])
-    force = R_SL.apply(R.inv().apply(np.gradient(np.gradient(place, time, axis=0), time, axis=0) + [0.0, 0.0, 9.81]))
-    rate = np.gradient(angle, time)[:, None] * np.round(R_SL.apply(axis), 12)
-    assert find_faults({"one": (time, rate, np.round(force, 9))}) == {}
-
-
 def test_real_sensors_measure(data: Path) -> None:
     for path in sorted((data / "broad").glob("*.mat")):
         trial = read_broad(path)
@@ -264,19 +230,6 @@ def test_arrays_of_a_sensor_that_does_not_measure_are_refused(signals: str, sinc
 # Lost samples are not measured ones --------------------------------------------------------------------------------
 
 
-def lost(recording: Recording, name: str, first: float, last: float) -> Recording:
-    """The recording with a sensor's samples bridged from `first` to `last` [s] as reading does: at rest, on a line."""
-    gap = (recording.time >= first) & (recording.time <= last)
-    sensor = recording.sensors[name]
-    gyro, accel = sensor.gyro_S.copy(), sensor.accel_S.copy()
-    gyro[gap] = 0.0
-    ends = [max(int(np.argmax(gap)) - 1, 0), min(len(gap) - 1, len(gap) - int(np.argmax(gap[::-1])))]
-    accel[gap] = np.column_stack(
-        [np.interp(recording.time[gap], recording.time[ends], accel[ends, axis]) for axis in range(3)]
-    )
-    return with_sensor(recording, name, gyro_S=gyro, accel_S=accel, gap=gap)
-
-
 @pytest.mark.parametrize("frozen", [False, True])
 def test_a_sensor_that_is_lost_in_the_start_pose_is_not_aligned_by_invention(
     frozen: bool, made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -293,23 +246,6 @@ def test_a_sensor_that_is_lost_in_the_start_pose_is_not_aligned_by_invention(
     line = refused(["track", str(path), "--gaps", "-o", str(tmp_path / "out")], capsys)
     assert f"sensors.{BROKEN}" in line
     assert f"take [sensors.{BROKEN}] out" in line
-
-
-def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simulation) -> None:
-    """Orientations of an arm that was lost before it was raised, and bridged towards where it was seen again."""
-    whole, n = made.recording("gap"), len(made.recording("gap"))
-    gap = (whole.time > 2.7) & (whole.time < 5.5)
-    raised = np.clip((whole.time - 2.7) / 2.8, 0.0, 1.0)[:, None] * [0.0, -1.5, 0.0]
-    quat_VS = Rotation.from_rotvec(raised).as_quat()
-    ready = replace(
-        whole,
-        sensors={"torso": OrientationSensor(quat_VS, gap=gap), "head": OrientationSensor(quat_VS[:n])},
-    )
-    both = estimate_segments(ready)
-    assert [(d.code, d.place) for d in both.diagnostics] == [("static-phase-trimmed", "head")]
-    assert both.start[1] < 2.7
-    alone = estimate_segments(replace(ready, sensors={"torso": ready.sensors["torso"]}))
-    assert Rotation.from_quat(alone.quat_LS["torso"]).magnitude() < 1e-6
 
 
 # Right, and once refused -------------------------------------------------------------------------------------------
@@ -392,13 +328,3 @@ def test_a_start_pose_that_was_guessed_says_so(
     line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
     assert "guessed" in line
     assert "[phases] start = [[from, to]]" in line
-
-
-def test_times_on_a_clock_since_1970_can_be_found(made: Simulation, tmp_path: Path) -> None:
-    whole = stopped(made.recording("epoch"), "gyro accel", 9.0)
-    epoch = replace(whole, time=whole.time + 1.7e9, phases={"start": ((1.7e9 + 0.5, 1.7e9 + 4.5),)})
-    read = load_session(written(tmp_path / "in", epoch))
-    texts = {each.code: render(each).what for each in estimate_segments(replace(read, phases={})).diagnostics}
-    assert "from 1700000009 s to 1700000025.38 s" in texts["sensor-frozen"]
-    assert " 17000000" in texts["start-pose-guessed"]
-    assert not any("e+09" in text for text in texts.values())

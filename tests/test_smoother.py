@@ -103,11 +103,3 @@ def test_short_recordings_and_open_blocks(length: int) -> None:
     # After the last whole block there is nothing that the filter does not know.
     np.testing.assert_allclose(smoothed.quat_VS[-1], forward.quat_VS[-1], atol=1e-12)
     np.testing.assert_allclose(cov(smoothed)[-1], cov(forward)[-1], atol=1e-12)
-
-
-def test_a_run_starts_anew() -> None:
-    of = part(case(3), slice(0, 1500))
-    smoother = Smoother(of.noise, RATE, of.start)
-    first, again = (smoother.run(of.gyro, of.accel, of.static) for _ in range(2))
-    for one, other in zip(first, again, strict=True):
-        np.testing.assert_array_equal(one, other)

@@ -69,7 +69,7 @@ def test_any_cut_and_one_by_one_give_the_same() -> None:
         np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
-@pytest.mark.parametrize("rest_begins", range(500, 551))
+@pytest.mark.parametrize("rest_begins", range(500, 551, 10))
 def test_a_window_at_rest_is_exact_right_after_a_blow(rest_begins: int) -> None:
     """Rest of 1e-3 after 1e6, at every place of the block: the variance is right to 1e-12."""
     rng = np.random.default_rng(rest_begins)
@@ -127,7 +127,7 @@ def chair(rate_deg_s: float, seed: int = 0, sway_deg_s: float = 0.0) -> tuple[np
     return gyro, accel, R
 
 
-@pytest.mark.parametrize("rate", [0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0, 180.0])
+@pytest.mark.parametrize("rate", [0.5, 5.0, 60.0])
 @pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
 def test_an_office_chair_is_no_bias(method: str, rate: float) -> None:
     gyro, accel, R = chair(rate)
@@ -173,23 +173,6 @@ def test_the_start_of_a_smooth_motion_is_not_static(rate_hz: float) -> None:
             late.append(sensor.time[np.flatnonzero(static & (sensor.time < 10.0))[-1]] - sensor.moving[0])
     assert np.mean(ends[StaticTest()]) < 0.1  # [s]
     assert np.mean(ends[PaperTest()]) > (0.12 if rate_hz > 500.0 else 0.0)
-
-
-def test_a_bias_that_warms_up_is_followed() -> None:
-    """0.2 deg/s in a quarter of an hour, about the vertical, at rest for two seconds in each minute."""
-    rng = np.random.default_rng(3)
-    n = round(900 * RATE)
-    time = np.arange(n) / RATE
-    resting = time % 60.0 < 5.0
-    gyro = rng.normal(scale=2e-3, size=(n, 3)) + np.deg2rad(0.2) * (time / 900.0)[:, None] * [0.0, 0.0, 1.0]
-    accel = rng.normal(scale=0.02, size=(n, 3)) + [0.0, 0.0, 9.81]
-    moving = ~resting
-    gyro[moving] += rng.normal(scale=0.5, size=(moving.sum(), 3))
-    detector = StaticDetector(estimate_noise(gyro[:400], accel[:400], RATE), RATE)
-    static = detector.run(gyro, accel)
-    settled = resting & (time % 60.0 > 1.0)
-    assert static[settled].mean() > 0.9
-    assert not static[moving & (time % 60.0 > 6.0)].any()
 
 
 def test_wrong_numbers_of_a_test_are_named() -> None:

@@ -152,8 +152,17 @@ def estimate_orientation(
         raise BadOption(f"rate_hz = {rate_hz} and static = {static}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
-    _check_values("gyro_S", gyro, HIGHEST_RATE, "rad/s")
-    _check_values("accel_S", accel, HIGHEST_ACCEL, "m/s^2")
+    for name, values, most, unit in (
+        ("gyro_S", gyro, HIGHEST_RATE, "rad/s"),
+        ("accel_S", accel, HIGHEST_ACCEL, "m/s^2"),
+    ):
+        largest = max(values.max(initial=0.0), -values.min(initial=0.0))
+        if not largest < np.inf:  # NaN
+            raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
+        if largest > most:
+            raise BadData(
+                f"{name} has a value of {largest:.6g}: no sensor measures above {most:g} {unit}; check the unit"
+            )
     for fault in find_faults({"": (np.arange(len(gyro)) / rate_hz, gyro, accel)}).get("", []):
         raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise: SensorNoise = TYPICAL
@@ -172,16 +181,3 @@ def estimate_orientation(
     sensor = ImuSensor(gyro, accel, gyro_range=find_gyro_range(gyro, accel))
     filters = SensorFilters({"": noise}, method=method, params=params, static_test=static_test, start=start)
     return filters.push(Recording("", np.empty(len(gyro)), rate_hz, {"": sensor}))[""]._replace(diagnostics=diagnostics)
-
-
-def _check_values(name: str, values: np.ndarray, most: float, unit: str) -> None:
-    """Raise `BadData` where values are not finite, or larger than a sensor measures."""
-    if max(values.max(initial=0.0), -values.min(initial=0.0)) <= most:  # false for NaN
-        return
-    if not np.isfinite(values).all():
-        raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
-    k, axis = np.unravel_index(int(np.argmax(np.abs(values))), values.shape)
-    raise BadData(
-        f"{name}[{k}, {axis}] = {values[k, axis]:.6g}: no sensor measures above {most:g} {unit}; check the unit, and "
-        f"fill or cut what is no measurement"
-    )

@@ -12,7 +12,8 @@ from scipy.special import stdtr  # of Student; scipy.stats takes half a second t
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, WeposeError
-from ..recording import ImuSensor, OrientationSensor, Recording, format_span, format_time
+from ..recording import ImuSensor, OrientationSensor, Recording, Sensor, format_span, format_time
+from ..recording.gaps import find_runs
 from ..recording.sensors import compute_rate
 from .noise import SensorNoise, estimate_noise
 
@@ -122,11 +123,11 @@ def _find_static_part(
     BadPhase
         The interval has motion in it, and no part of `LEAST_STATIC_S` without.
     """
-    span = recording.span(interval)
-    size = max(1, round(BLOCK_S * recording.rate_hz))
+    span, rate_hz = recording.span(interval), recording.rate_hz
+    size = max(1, round(BLOCK_S * rate_hz))
     firsts = np.arange(span.start, span.stop, size)  # first sample of each block
     rates_deg_s = {
-        segment: _compute_block_rates(recording, segment, firsts, span.stop)
+        segment: _compute_block_rates(sensor.part(span), rate_hz, size)
         for segment, sensor in recording.sensors.items()
         if not sensor.aligned
     }
@@ -134,12 +135,11 @@ def _find_static_part(
     if not moves.any():
         return interval, []
     moves = np.convolve(moves, [1, 1, 1], mode="same") > 0  # motion begins and ends gently: a block more on both sides
-    edges = np.flatnonzero(np.diff(np.concatenate(([True], moves, [True]))))
-    begin, end = max(zip(edges[::2], edges[1::2], strict=True), key=lambda run: run[1] - run[0], default=(0, 0))
+    begin, end = max(find_runs(~moves), key=lambda run: run[1] - run[0], default=(0, 0))
     stops = np.append(firsts[1:], span.stop)
     static = (float(recording.time[firsts[begin]]), float(recording.time[stops[end - 1] - 1]))
-    fastest = max(rates_deg_s, key=lambda segment: float(np.nanmax(rates_deg_s[segment])))
-    rate_deg_s = float(np.nanmax(rates_deg_s[fastest]))
+    fastest = max(rates_deg_s, key=lambda segment: float(np.max(rates_deg_s[segment])))
+    rate_deg_s = float(np.max(rates_deg_s[fastest]))
     if begin == end or static[1] - static[0] < LEAST_STATIC_S:
         raise BadPhase(
             f"{recording.where()}: phases.{phase}: sensors.{fastest} turns at up to {rate_deg_s:.0f} deg/s in "
@@ -158,22 +158,15 @@ def _find_static_part(
     return static, [Diagnostic("static-phase-trimmed", WARNING, fastest, value, limit, facts)]
 
 
-def _compute_block_rates(recording: Recording, segment: str, firsts: np.ndarray, stop: int) -> np.ndarray:
-    """Compute the mean rate (k,) [deg/s] of a sensor over blocks of samples, without its bias; NaN where it is lost.
-
-    Parameters
-    ----------
-    firsts : (k,) the first sample of each block
-    stop : the sample after the last block
-    """
-    part = recording.sensors[segment].part(slice(int(firsts[0]), stop))
-    gyro_S = compute_rate(part, recording.rate_hz)
-    measured = np.ones(len(gyro_S)) if part.gap is None else 1.0 - part.gap
-    rows = firsts - firsts[0]
-    counts = np.add.reduceat(measured, rows)
-    sums = np.add.reduceat(gyro_S * measured[:, None], rows)
-    means = np.divide(sums, counts[:, None], out=np.full_like(sums, np.nan), where=counts[:, None] > 0.0)
-    return np.degrees(np.linalg.norm(means - np.nanmedian(means, axis=0), axis=1))
+def _compute_block_rates(sensor: Sensor, rate_hz: float, size: int) -> np.ndarray:
+    """Compute the mean rate (k,) [deg/s] of a sensor over blocks, without its bias; zero where it is lost."""
+    rate = compute_rate(sensor, rate_hz)
+    measured = np.ones(len(rate)) if sensor.gap is None else 1.0 - sensor.gap
+    blocks = np.arange(0, len(rate), size)
+    counts = np.add.reduceat(measured, blocks)
+    means = np.add.reduceat(rate * measured[:, None], blocks) / np.maximum(1.0, counts)[:, None]
+    off = means - np.median(means[counts > 0.0], axis=0)
+    return np.where(counts > 0.0, np.degrees(np.linalg.norm(off, axis=1)), 0.0)
 
 
 def check_common_rotation(

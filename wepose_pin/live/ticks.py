@@ -170,10 +170,11 @@ class TickStream:
         if self.clock is not None:
             waiting, self._waiting = self._waiting, []
             for each in waiting:
-                for ticks in self.clock.iterate_ticks(each):
+                ticks = self.clock.push(each)
+                if len(ticks.time):
                     yield ticks
-                    if self.log is not None:
-                        self.log.flush_if_due()
+                if self.log is not None:
+                    self.log.flush_if_due()
 
     def _begin_ticks(self) -> None:
         which, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])

@@ -6,7 +6,7 @@ file with the arrivals therefore gives bit-identical ticks.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -183,7 +183,6 @@ class StreamSynchronizer:
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
         self._buffers = np.zeros((k, room, _WIDTH))
         self._out = np.empty((_OUT, k, 6)), np.empty((_OUT, k), dtype=np.bool_)
-        self._none = Ticks(0, np.empty(0), np.empty((0, k, 3)), np.empty((0, k, 3)), np.empty((0, k), dtype=np.bool_))
 
     @property
     def next_tick(self) -> int:
@@ -197,27 +196,16 @@ class StreamSynchronizer:
 
     def push(self, arrivals: Arrivals) -> Ticks:
         """Take samples and return the ticks that they complete, often none."""
-        parts = list(self.iterate_ticks(arrivals))
-        if len(parts) < 2:
-            return parts[0] if parts else self._none
-        return Ticks(parts[0].first, *map(np.concatenate, tuple(zip(*parts, strict=True))[1:]))
-
-    def iterate_ticks(self, arrivals: Arrivals) -> Iterator[Ticks]:
-        """Iterate over the ticks of `push` in blocks of at most a thousand; the caller takes them all.
-
-        After an hour of silence there are millions.
-        """
-        values, lost = self._out
         samples = np.column_stack([arrivals.time, arrivals.gyro_S, arrivals.accel_S])
-        next_sample, count = 0, _OUT
+        first, next_sample, count, blocks = self.next_tick, 0, _OUT, []
         while next_sample < len(samples) or count == _OUT:
-            first = self.next_tick
             next_sample, count = _take_samples(
-                self._clock, self._sensors, self._buffers, arrivals.which, samples, next_sample, values, lost
+                self._clock, self._sensors, self._buffers, arrivals.which, samples, next_sample, *self._out
             )
-            if count:
-                time, block = self.begin + np.arange(first, first + count) / self.rate_hz, values[:count].copy()
-                yield Ticks(first, time, block[:, :, :3], block[:, :, 3:], lost[:count].copy())
+            blocks.append([each[:count].copy() for each in self._out])
+        values, lost = (np.concatenate(each) for each in zip(*blocks, strict=True))
+        time = self.begin + np.arange(first, first + len(lost)) / self.rate_hz
+        return Ticks(first, time, values[:, :, :3], values[:, :, 3:], lost)
 
 
 # The kernels below take `clock` and `sensor` as records of `CLOCK` and `SENSOR`, and a `sample` as a row of a buffer.

@@ -149,18 +149,7 @@ class Recording:
         return cls(name, time, rate_hz, built, phases or {}).check()
 
     def check(self) -> Recording:
-        """Check a recording that was built in code, and return it.
-
-        Raises
-        ------
-        BadOption
-            A field has a wrong type, or a name is not known.
-        BadData
-            Shapes differ, a number is not finite, time does not increase or contradicts `rate_hz`; specific force in
-            another unit, such as g.
-        BadPhase
-            A phase is empty or outside the recording.
-        """
+        """Check a recording that was built in code, as `check_recording`, and its unit of specific force; return it."""
         check_recording(self)
         for segment, sensor in self.imus.items():
             force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
@@ -284,10 +273,7 @@ def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
                 f"all); fill or cut the gap first"
             )
     if isinstance(sensor, OrientationSensor):
-        length = np.linalg.norm(sensor.quat_VS, axis=1)
-        k = int(np.argmax(np.abs(length - 1.0)))
-        if abs(length[k] - 1.0) > 1e-6:
-            raise BadData(f"{place}.orientation: no unit quaternion at {time[k]:.3f} s: length {length[k]:.6g}")
+        check_numbers(f"{place}.orientation", sensor.quat_VS, (len(time), 4), unit=1e-6)
     if sensor.stated_quat_LS is not None:
         check_numbers(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
     if sensor.gap is not None:
