@@ -7,6 +7,7 @@ clasp. A value of 1 is exact, above it the statement is too small, below it too 
 from __future__ import annotations
 
 import argparse
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -130,13 +131,15 @@ def summarize(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
             continue
         # A person counts as one, however many samples: errors of a person's samples are alike.
         each = [np.array(result[quantity]) for result in good]
-        by_std = np.sqrt([np.nanmean((pairs[:, 0] / pairs[:, 1]) ** 2) for pairs in each])
-        rows[quantity] = {
-            "error": float(np.sqrt(np.nanmean([np.nanmean(pairs[:, 0] ** 2) for pairs in each]))),
-            "std": float(np.sqrt(np.nanmean([np.nanmean(pairs[:, 1] ** 2) for pairs in each]))),
-            "by_std": float(np.sqrt(np.nanmean(by_std**2))),
-            "largest": float(np.nanmax(by_std)),
-        }
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a mean of NaN alone: of a quantity without a ±
+            by_std = np.sqrt([np.nanmean((pairs[:, 0] / pairs[:, 1]) ** 2) for pairs in each])
+            rows[quantity] = {
+                "error": float(np.sqrt(np.nanmean([np.nanmean(pairs[:, 0] ** 2) for pairs in each]))),
+                "std": float(np.sqrt(np.nanmean([np.nanmean(pairs[:, 1] ** 2) for pairs in each]))),
+                "by_std": float(np.sqrt(np.nanmean(by_std**2))),
+                "largest": float(np.nanmax(by_std)),
+            }
     return rows
 
 
