@@ -34,12 +34,12 @@ def signals(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def fed(synchronizer: StreamSynchronizer, came: Iterable[tuple[int, float, np.ndarray, np.ndarray]]) -> Ticks:
     """All ticks of single samples (sensor, time, gyro, accel) that come one by one."""
     made = [
-        synchronizer.push(
+        ticks
+        for i, t, g, a in came
+        for ticks in synchronizer.push(
             order_arrivals([Samples(synchronizer.sensors[i], np.array([t]), g[None], a[None])], synchronizer.sensors),
         )
-        for i, t, g, a in came
     ]
-    made = [ticks for ticks in made if len(ticks.time)]
     assert all(a.first + len(a.time) == b.first for a, b in pairwise(made))
     return Ticks(made[0].first, *(np.concatenate([getattr(t, part) for t in made]) for part in Ticks._fields[1:]))
 
@@ -65,7 +65,9 @@ def test_the_same_arrivals_in_blocks_give_the_same_ticks() -> None:
     parts = [np.array([each[k] for each in came]) for k in (2, 3, 4)]
     blocks = StreamSynchronizer(NAMES, RATE, BEGIN)
     cuts = [0, 1, 2, 50, 700, len(came)]
-    made = [blocks.push(Arrivals(which[a:b], *(part[a:b] for part in parts))) for a, b in pairwise(cuts)]
+    made = [
+        ticks for a, b in pairwise(cuts) for ticks in blocks.push(Arrivals(which[a:b], *(part[a:b] for part in parts)))
+    ]
     for part in ("gyro_S", "accel_S", "lost"):
         whole = np.concatenate([getattr(ticks, part) for ticks in made])
         np.testing.assert_array_equal(whole, getattr(first, part))
@@ -146,6 +148,16 @@ def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:
     expected = np.interp(ticks.time, times, np.cumsum(rate[:, 0]) / RATE)
     np.testing.assert_allclose(turned - turned[10], expected - expected[10], atol=2e-4)
     np.testing.assert_allclose(ticks.accel_S[:, 0, 2], 9.8 * np.cos(2.0 * np.pi * 0.7 * ticks.time), atol=6e-3)
+
+
+def test_a_stream_that_resumes_after_hours_makes_its_ticks_block_by_block() -> None:
+    synchronizer = StreamSynchronizer(NAMES[:1], RATE, BEGIN)
+    fed(synchronizer, [(0, tick_time(k), np.ones(3), np.ones(3)) for k in range(100)])
+    time = BEGIN + 8.0 * 3600.0 + np.arange(10) / RATE
+    resumed = synchronizer.push(Arrivals(np.zeros(10, np.uint8), time, np.ones((10, 3)), np.ones((10, 3))))
+    sizes = [len(ticks.time) for ticks in resumed]
+    assert sum(sizes) > 2_800_000
+    assert max(sizes) < 10_000
 
 
 def test_a_faster_sensor_is_averaged_over_the_step() -> None:

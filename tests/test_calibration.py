@@ -65,6 +65,23 @@ def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tupl
     assert again[1, 1] > before[1, 1]
 
 
+def test_all_mounts_share_the_heading_of_a_start_pose_in_which_the_arms_are_raised() -> None:
+    """The torso faces forwards to within its soft tissue: about the vertical, which is across an arm in the T-pose."""
+    person = simulate_person(11)
+    recording = ready(
+        simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0, protocol="clasp+t_pose")
+    )
+    phases = {**recording.phases, "start": recording.phases["t_pose"]}
+    calibration = calibrate(replace(recording, phases=phases, start_pose="t_pose"))
+    subject, start_pose = calibration.subject, calibration.problem.start_pose
+    up = {name: start_pose.rotation(name)[2] for name in subject.mounts}
+    assert abs(up["left_upper_arm"][2]) < 0.1
+    for name in subject.mounts:
+        rows = [[subject.order.index(row) for row in mount_rows(each)] for each in ("torso", name)]
+        shared = up["torso"] @ subject.covariance[np.ix_(*rows)] @ up[name]
+        assert shared > np.deg2rad(0.6) ** 2, name
+
+
 def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     """Exact motion, no noise: headings drawn from the full circle come back without a guess."""
     person = simulate_person(3)

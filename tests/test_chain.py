@@ -94,6 +94,14 @@ def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
     assert max(rms_deg(angle) for angle in residual.values()) < 0.5
 
 
+def test_the_ranges_of_joints_are_those_of_all_samples(urdf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wepose_pin.tracking.summary.MOST_SAMPLES", 20)
+    tracked = track(made(urdf, ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"])[0], model=urdf)
+    for name, span in summarize(tracked).content["joints"].items():
+        assert span["min"] == round(float(tracked.joints[name].min()), 5)
+        assert span["max"] == round(float(tracked.joints[name].max()), 5)
+
+
 def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) -> None:
     recording, q = made(urdf, ["forearm_link"])
     tracked = track(recording, model=urdf)

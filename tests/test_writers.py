@@ -46,6 +46,15 @@ def test_nothing_is_overwritten_without_force_and_nothing_else_with_it(tmp_path:
         pass
 
 
+def test_a_folder_in_the_way_of_a_file_leaves_everything_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "out" / "b").mkdir(parents=True)
+    (tmp_path / "out" / "a").write_text("old")
+    with pytest.raises(ExistingOutput, match="b: is in the way"), whole_folder(tmp_path / "out", True) as folder:  # noqa: PT012
+        for name in "ab":
+            (folder / name).write_text("new")
+    assert (tmp_path / "out" / "a").read_text() == "old"
+
+
 def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ExistingOutput, match="is a file"), whole_folder(tmp_path / "file" / "out"):

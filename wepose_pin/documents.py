@@ -405,8 +405,13 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
             yield partial
         _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
         if out.exists():
-            for path in sorted(partial.rglob("*")):
-                target = out / path.relative_to(partial)
+            targets = {path: out / path.relative_to(partial) for path in sorted(partial.rglob("*"))}
+            for path, target in targets.items():
+                if target.exists() and target.is_dir() != path.is_dir():
+                    raise ExistingOutput(
+                        f"{target}: is in the way; nothing was written, move it or name another folder"
+                    )
+            for path, target in targets.items():
                 target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
         else:
             out.parent.mkdir(parents=True, exist_ok=True)

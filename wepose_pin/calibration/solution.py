@@ -260,9 +260,12 @@ def _project_to_subject(
     known = {} if problem.recording.remounted else problem.prior.mounts
     segments = problem.model.table.segments
     tissue = {name: scatter * np.array(segment.soft_tissue.std) for name, segment in segments.items()}
-    headings = K + 3 * np.array([i for i, name in enumerate(layout.sensors) if name not in known], dtype=int) + 2
-    projected[np.ix_(headings, headings)] += tissue[problem.model.table.reference][2] ** 2
-    for i in (headings - K) // 3:
-        tilts = K + 3 * i + np.arange(2)
-        projected[tilts, tilts] += np.square(tissue[layout.sensors[i]][:2])
+    up = np.zeros(len(projected))  # the vertical of the start pose, in the frames of the new mounts' segments
+    for i, name in enumerate(layout.sensors):
+        if name not in known:
+            mount, R_WL = slice(K + 3 * i, K + 3 * i + 3), problem.start_pose.rotation(name)
+            up[mount] = R_WL[2]
+            horizontal = R_WL[:2].T @ R_WL[:2]
+            projected[mount, mount] += horizontal @ np.diag(tissue[name] ** 2) @ horizontal
+    projected += tissue[problem.model.table.reference][2] ** 2 * np.outer(up, up)
     return (*layout.lengths, *rows, *of_girdles), projected

@@ -261,7 +261,7 @@ class Attempt:
 
     def push(self, samples: Sequence[Samples]) -> list[Ticks]:
         """Record samples of the source; return the ticks that they complete."""
-        ticks = [each for each in self.stream.push(self._source.rename(samples)) if len(each.time)]
+        ticks = [*self.stream.push(self._source.rename(samples))]
         self._ticks += ticks
         return ticks
 

@@ -170,9 +170,7 @@ class TickStream:
         if self.clock is not None:
             waiting, self._waiting = self._waiting, []
             for each in waiting:
-                ticks = self.clock.push(each)
-                if len(ticks.time):
-                    yield ticks
+                yield from self.clock.push(each)
                 if self.log is not None:
                     self.log.flush_if_due()
 

@@ -131,7 +131,7 @@ def read_live_log(path: Path) -> LiveRecording:
                 resets.append(int(event["tick"]))
             else:
                 markers.add(event["kind"], event)
-        ticks = [] if synchronizer is None else [synchronizer.push(arrivals)]
+        ticks = [] if synchronizer is None else [*synchronizer.push(arrivals)]
         if synchronizer is None or synchronizer.next_tick < 2 or (start and synchronizer.next_tick <= start[1] + 1):
             raise BadData(_BROKE_OFF.format(path))
         resets = [tick for tick in resets if tick < synchronizer.next_tick]
@@ -244,7 +244,6 @@ def build_recording(
     the start pose; None: that of the header's phases. `resets`: ticks before which the headings were reset. `BadData`
     is raised where a sensor never sent a sample.
     """
-    ticks = [t for t in ticks if len(t.time)]
     first = ticks[0].first
     count = sum(len(t.time) for t in ticks) if last is None else last + 1 - first
     time = np.concatenate([t.time for t in ticks])[:count]

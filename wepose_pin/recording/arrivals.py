@@ -6,7 +6,7 @@ file with the arrivals therefore gives bit-identical ticks.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -194,18 +194,19 @@ class StreamSynchronizer:
         """Time [s] of the newest sample of all; −inf before the first."""
         return float(self._clock["newest"][0])
 
-    def push(self, arrivals: Arrivals) -> Ticks:
-        """Take samples and return the ticks that they complete, often none."""
+    def push(self, arrivals: Arrivals) -> Iterator[Ticks]:
+        """Take samples and iterate over the ticks that they complete, some at a time: after a silence they are many."""
         samples = np.column_stack([arrivals.time, arrivals.gyro_S, arrivals.accel_S])
-        first, next_sample, count, blocks = self.next_tick, 0, _OUT, []
+        next_sample, count = 0, _OUT
         while next_sample < len(samples) or count == _OUT:
+            first = self.next_tick
             next_sample, count = _take_samples(
                 self._clock, self._sensors, self._buffers, arrivals.which, samples, next_sample, *self._out
             )
-            blocks.append([each[:count].copy() for each in self._out])
-        values, lost = (np.concatenate(each) for each in zip(*blocks, strict=True))
-        time = self.begin + np.arange(first, first + len(lost)) / self.rate_hz
-        return Ticks(first, time, values[:, :, :3], values[:, :, 3:], lost)
+            if count:
+                values, lost = (each[:count].copy() for each in self._out)
+                time = self.begin + np.arange(first, first + count) / self.rate_hz
+                yield Ticks(first, time, values[:, :, :3], values[:, :, 3:], lost)
 
 
 # The kernels below take `clock` and `sensor` as records of `CLOCK` and `SENSOR`, and a `sample` as a row of a buffer.

@@ -93,6 +93,7 @@ class SummaryAccumulator:
         self._static: dict[str, list[np.ndarray]] = {}
         self._peak_speed: dict[str, float] = {}  # [m/s] of each tip
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
+        self._joints: dict[str, tuple[float, float]] = {}  # of a mechanism: least and most
 
     def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
         """Iterate over chunks, and add each."""
@@ -114,6 +115,9 @@ class SummaryAccumulator:
             self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), tip.peak_speed)
         for segment, angle in tracked.compute_orientation_residuals().items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
+        for name, values in tracked.joints.items() if tracked.model.table.is_mechanism else ():
+            least, most = self._joints.get(name, (np.inf, -np.inf))
+            self._joints[name] = float(np.minimum(least, values.min())), float(np.maximum(most, values.max()))
         self._samples += len(tracked.time)
         self.last = tracked
 
@@ -135,7 +139,7 @@ class SummaryAccumulator:
         diagnostics = (*last.segments.diagnostics, *last.model.diagnostics, *_diagnose_model(last, residual_rms))
         diagnostics = merge(diagnostics, _diagnose_motion(tracked, measures))
         ordered = tuple(gravest_first(drop_consequences(diagnostics)))
-        return TrackSummary(self._compose(tracked, measures, residual_rms, ordered), ordered, tracked, measures)
+        return TrackSummary(self._compose(measures, residual_rms, ordered), ordered, tracked, measures)
 
     def _measure(self, tracked: TrackResult, recording: Recording) -> Measures:
         """All measures: `tracked` has the samples that are shown, `recording` all of them."""
@@ -161,7 +165,6 @@ class SummaryAccumulator:
 
     def _compose(
         self,
-        tracked: TrackResult,
         measures: Measures,
         residual_rms: dict[str, float],
         diagnostics: Iterable[Diagnostic],
@@ -203,8 +206,8 @@ class SummaryAccumulator:
             content |= {
                 "start_joints": dict(table.poses.get(recording.start_pose, recording.joints)),  # others are at zero
                 "joints": {
-                    name: {"min": round(float(values.min()), 5), "max": round(float(values.max()), 5)}
-                    for name, values in tracked.joints.items()
+                    name: {"min": round(least, 5), "max": round(most, 5)}
+                    for name, (least, most) in self._joints.items()
                 },
                 "undetermined_joints": last.find_undetermined_joints(),
             }
