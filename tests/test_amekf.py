@@ -171,8 +171,8 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     filter_.state["P"][0, :, :STATES][:] = np.outer(scale, scale) * (np.eye(STATES) + half @ half.T)
     filter_.state["x"][0][V : P + 2] = 0.1, -0.2, 0.05, 0.02
     x_before, P_start = filter_.state["x"][0].copy(), filter_.state["P"][0, :, :STATES].copy()
-    blocks = np.empty(1, BLOCK)
-    result = filter_.run(of.gyro[at], of.accel[at], np.full(25, still), blocks=blocks)
+    filter_.blocks = blocks = np.empty(1, BLOCK)
+    result = filter_.run(of.gyro[at], of.accel[at], np.full(25, still))
 
     rows, T = np.empty((7, STATES)), 0.25
     fill_transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)

@@ -28,8 +28,8 @@ def test_the_backward_pass_is_the_textbook_s() -> None:
     P, F, P_before, correction, quats = [forward.state["P"][0, :, :STATES].copy()], [], [], [], []
     for first in range(0, 600, 25):
         at = slice(first, first + 25)
-        blocks = np.empty(1, BLOCK)
-        quats.append(forward.run(of.gyro[at], of.accel[at], of.static[at], blocks=blocks).quat_VS[-1])
+        forward.blocks = blocks = np.empty(1, BLOCK)
+        quats.append(forward.run(of.gyro[at], of.accel[at], of.static[at]).quat_VS[-1])
         P.append(forward.state["P"][0, :, :STATES].copy())
         rows, whole = np.empty((7, STATES)), np.eye(STATES)
         fill_transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)

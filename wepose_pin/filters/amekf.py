@@ -20,7 +20,9 @@ velocity is zero and the gyroscope measures its bias.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +42,6 @@ from .base import (
     bridge_rate,
     into_sensor,
     make_record,
-    make_run,
-    prepare_samples,
 )
 from .noise import SensorNoise
 
@@ -89,7 +89,6 @@ BLOCK = np.dtype(
     ],
     align=True,
 )
-_NO_BLOCKS = np.empty(0, BLOCK)
 
 
 @dataclass(frozen=True)
@@ -382,10 +381,10 @@ class Amekf(OrientationFilter):
     alone, and the velocity's covariance grows. An impact (`AmekfParams.impact`) increases it too. A jump of the bias is
     adopted in the next static phase; until then the tilt error reaches some degrees. Without a static phase everything
     is estimated in motion: the tilt in ten seconds, the other parameters in about a minute. Time is not an input:
-    readers bridge gaps and remove duplicates.
+    readers bridge gaps and remove duplicates. A run fills one of `blocks`, an array of `BLOCK`, at the end of each.
     """
 
-    params_type = AmekfParams
+    params_type, blocks = AmekfParams, np.empty(0, BLOCK)
 
     def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise, p, rate_hz = self.noise, self.params, self.rate_hz
@@ -427,19 +426,8 @@ class Amekf(OrientationFilter):
         )
         return state, _build_model(noise, rate_hz, max(1, round(p.block_s * rate_hz)), p)
 
-    def run(
-        self,
-        gyro_S: np.ndarray,
-        accel_S: np.ndarray,
-        static: np.ndarray | bool,
-        out: FilterRun | None = None,
-        blocks: np.ndarray = _NO_BLOCKS,
-    ) -> FilterRun:
-        """Filter as `OrientationFilter.run`, and fill one of `blocks`, an array of `BLOCK`, at the end of each."""
-        gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        out = out or make_run(len(gyro))
-        _run(self.state, self.model, gyro, accel, is_static, blocks, *out)
-        return out
+    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray, out: FilterRun) -> Callable[[], None]:
+        return partial(_run, self.state, self.model, gyro_S, accel_S, static, self.blocks, *out)
 
 
 def _build_model(noise: SensorNoise, rate_hz: float, block_samples: int, p: AmekfParams) -> np.ndarray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -157,7 +158,7 @@ class SensorFilters:
             self.static = np.zeros(k, dtype=np.bool_)
             self._now = make_run(k, covariance=any(each.attitude_cov is not None for each in orientations))
             self.quat_VS, self.gyro_bias, self.attitude_cov, self.about_vertical = self._now
-            self._rows = [slice(i, i + 1) for i in range(k)]
+            self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
         for i, each in enumerate(orientations):
             for now, name in zip(self._now, FilterRun._fields, strict=True):
                 if now is not None and len(each.quat_VS):
@@ -171,10 +172,20 @@ class SensorFilters:
         """
         if np.shape(gyro_S) != self.gyro_bias.shape or np.shape(accel_S) != self.gyro_bias.shape:
             raise BadData(f"gyro_S {np.shape(gyro_S)} and accel_S {np.shape(accel_S)}: {len(self.names)} rows of three")
-        for name, one in zip(self.names, self._rows, strict=True):
-            self.static[one] = self._detectors[name].run(gyro_S[one], accel_S[one])
-            self._filters[name].run(gyro_S[one], accel_S[one], self.static[one], self._now.part(one))
+        self._gyro_S[:], self._accel_S[:] = gyro_S, accel_S
+        for call in self._calls:
+            call()
         return self.quat_VS
+
+    @cached_property
+    def _calls(self) -> list[Callable[[], None]]:
+        """What a step calls, on arrays that stay: to prepare arguments takes longer than to filter a sample."""
+        calls: list[Callable[[], None]] = []
+        for i, name in enumerate(self.names):
+            one = slice(i, i + 1)
+            sample = self._gyro_S[one], self._accel_S[one], self.static[one]
+            calls += self._detectors[name].bind(*sample), self._filters[name].bind(*sample, self._now.part(one))
+        return calls
 
     def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
         """Filter a chunk of one sensor."""

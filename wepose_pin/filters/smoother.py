@@ -42,8 +42,8 @@ class Smoother(OrientationFilter):
         amekf = Amekf(self.noise, self.rate_hz, self.state["quat_VS"][0], self.params)
         is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
         P_rows, size = amekf.state["P"][0, list(SMOOTHED_STATES), :STATES], int(amekf.model["block_samples"][0])
-        blocks = np.empty(len(is_static) // size, BLOCK)
-        run = amekf.run(gyro_S, accel_S, is_static, out, blocks)
+        amekf.blocks = blocks = np.empty(len(is_static) // size, BLOCK)
+        run = amekf.run(gyro_S, accel_S, is_static, out)
         smoothed = _backward(blocks, P_rows, self.noise.gravity)
         _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, is_static, *run)
         return run

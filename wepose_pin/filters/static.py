@@ -13,7 +13,9 @@ means does not depend on the rate of sampling.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -103,13 +105,14 @@ class StaticDetector:
         self.test = test or USUAL_TEST
         n = self.test.samples(rate_hz)
         self._model = _build_model(noise, rate_hz, self.test)
+        # Arrays of their own, so that the compiled step is one for all rates of sampling
+        self._block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
+        self._tail = np.zeros((n, SUMS))  # sums of the block before, from each of its samples to its end
         self._state = make_record(
             samples=np.int64(0),  # in the current block
             has_block=np.bool_(False),  # there is a block before it
-            block=np.zeros((n, SIGNALS)),  # samples of the current block, then of the one before
             anchor=np.zeros(SIGNALS),  # the last sample of the block before
             head=np.zeros(SUMS),  # sums of the current block so far, while it does not move
-            tail=np.zeros((n, SUMS)),  # sums of the block before, from each of its samples to its end
             window=np.zeros(SUMS),  # sums of the window
             moves=np.bool_(False),  # a sample of the block is too far from the anchor for any static window
             moves_until=np.int64(-1),  # of the block before, the last sample that is; `tail` begins after it
@@ -122,8 +125,12 @@ class StaticDetector:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
         static = np.empty(len(gyro_S), dtype=np.bool_)
         gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
-        _run(self._state, self._model, gyro, accel, static)
+        self.bind(gyro, accel, static)()
         return static
+
+    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray) -> Callable[[], None]:
+        """Return a call that fills `static` (n,) from the samples then in `gyro_S`, `accel_S` (n, 3), contiguous."""
+        return partial(_run, self._state, self._model, self._block, self._tail, gyro_S, accel_S, static)
 
 
 def _build_model(noise: SensorNoise, rate_hz: float, test: StaticTest) -> np.ndarray:
@@ -170,12 +177,11 @@ def _add(sums, before, block, at, anchor):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _is_far(state, model, at):  # type: ignore[no-untyped-def]
+def _is_far(anchor, limit, block, at):  # type: ignore[no-untyped-def]
     """Return whether gyro at a sample is too far from the anchor for any static window with both.
 
     Two samples that differ by d make (N − 1) S ≥ d²/2; twice the limit is beyond rounding. NaN is not far.
     """
-    block, anchor, limit = state.block, state.anchor, model.limits[0]
     x, y, z = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
     return x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
 
@@ -202,13 +208,13 @@ def _is_within(window, limit, part, share):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _rate_is_steady(state, model):  # type: ignore[no-untyped-def]
+def _rate_is_steady(state, model, tail):  # type: ignore[no-untyped-def]
     """Condition (6): the mean rate of the newest part is near that of the window."""
-    tail, head, window, newest, M = state.tail, state.head, state.window, model.newest, model.rate_change
-    begin, share = state.samples - newest, newest / len(state.block)  # first sample of the newest part in the block
+    head, window, newest, M = state.head, state.window, model.newest, model.rate_change
+    begin, share = state.samples - newest, newest / len(tail)  # first sample of the newest part in the block
     x, y, z = head[0] - share * window[0], head[1] - share * window[1], head[2] - share * window[2]
     if begin < 0:
-        rest = tail[len(state.block) + begin]
+        rest = tail[len(tail) + begin]
         x, y, z = x + rest[0], y + rest[1], z + rest[2]
     elif begin > 0:
         rest = tail[begin - 1]
@@ -218,9 +224,9 @@ def _rate_is_steady(state, model):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _bias_agrees(state, model):  # type: ignore[no-untyped-def]
-    """Condition (5) for a window that passes the others; learns the bias."""
-    bias, anchor, window, n = state.bias, state.anchor, state.window, len(state.block)
+def _bias_agrees(state, model, n):  # type: ignore[no-untyped-def]
+    """Condition (5) for a window of n samples that passes the others; learns the bias."""
+    bias, anchor, window = state.bias, state.anchor, state.window
     gx, gy, gz = anchor[0] + window[0] / n, anchor[1] + window[1] / n, anchor[2] + window[2] / n
     ax, ay, az = anchor[3] + window[3] / n, anchor[4] + window[4] / n, anchor[5] + window[5] / n
     gx, gy, gz = gx - bias[0], gy - bias[1], gz - bias[2]
@@ -245,9 +251,9 @@ def _bias_agrees(state, model):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _add_sample(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
     """Add a sample; return where the window begins in the block before, or −1 where it is not full or surely moves."""
-    block, tail, at, anchor, head = state.block, state.tail, state.samples, state.anchor, state.head
+    at, anchor, head, limit = state.samples, state.anchor, state.head, model.limits[0]
     ax, ay, az = ax * model.inverse_gravity, ay * model.inverse_gravity, az * model.inverse_gravity
     norm = np.sqrt(ax * ax + ay * ay + az * az)
     block[at, 0], block[at, 1], block[at, 2], block[at, 6] = gx, gy, gz, norm
@@ -255,7 +261,7 @@ def _add_sample(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untype
     state.samples = at + 1
     if state.samples < len(block):
         if not state.moves:
-            state.moves = state.has_block and _is_far(state, model, at)
+            state.moves = state.has_block and _is_far(anchor, limit, block, at)
             _add(head, head, block, at, anchor)
             # No window needs the sums of the block before from here; those up to here serve condition (6).
             tail[at, 0], tail[at, 1], tail[at, 2] = head[0], head[1], head[2]
@@ -269,7 +275,7 @@ def _add_sample(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untype
     _add(tail[at], head, block, at, anchor)
     state.moves, state.moves_until, state.samples, state.has_block = False, -1, 0, True
     for before in range(at - 1, -1, -1):
-        if _is_far(state, model, before):
+        if _is_far(anchor, limit, block, before):
             state.moves_until = before
             return -1
         _add(tail[before], tail[before + 1], block, before, anchor)
@@ -277,25 +283,25 @@ def _add_sample(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untype
 
 
 @kernel
-def _run(states, models, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+def _run(states, models, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
     state, model = states[0], models[0]
-    window, anchor, limits, share = state.window, state.anchor, model.limits, 1.0 / len(state.block)
+    window, anchor, limits, share = state.window, state.anchor, model.limits, 1.0 / len(block)
     for k in range(len(gyro_S)):
         static[k] = False
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
-        first = _add_sample(state, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2])
+        first = _add_sample(state, model, block, tail, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2])
         state.bias_var += model.walk_var
         if first >= 0:
             for m in range(SUMS):
-                window[m] = state.head[m] + state.tail[first, m]
+                window[m] = state.head[m] + tail[first, m]
             norm = window[6] * share
             if (
                 abs(anchor[6] + norm - 1.0) <= model.norm_error  # (3)
                 and window[19] - window[6] * norm <= model.norm_variance  # (4)
                 and _is_within(window, limits[0], 0, share)  # (1)
                 and _is_within(window, limits[1], 1, share)  # (2)
-                and _rate_is_steady(state, model)  # (6)
+                and _rate_is_steady(state, model, tail)  # (6)
             ):
-                static[k] = _bias_agrees(state, model)  # (5)
+                static[k] = _bias_agrees(state, model, len(block))  # (5)
                 continue
         state.average_rate -= model.fade * state.average_rate
