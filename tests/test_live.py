@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from bodies import LENGTHS
 from mcap.reader import make_reader
+from numba.core.dispatcher import Dispatcher
 from scipy.spatial.transform import Rotation
 from test_causal import first
 
@@ -20,12 +22,13 @@ from wepose_pin import live
 from wepose_pin.body.subject import mount_rows, parse_subject, population_subject
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
 from wepose_pin.live import Output, Request
+from wepose_pin.live.loop import warm_up
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.readers.live_log import LiveRecording, read_live_log, read_messages
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
-from wepose_pin.simulation import Simulation
+from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.tracking import TrackResult, track
 from wepose_pin.writers.live_log import LiveLog
 
@@ -243,6 +246,21 @@ def test_measured_orientations_and_a_marked_clasp_give_the_same_bits(
     assert isinstance(read, OrientationSensor)
     assert np.array_equal(read.gap, gap)
     assert np.array_equal(read.quat_VS[~gap], simulation.quat_WS["left_forearm"][: len(recording)][~gap])
+
+
+def test_a_session_at_another_rate_compiles_nothing_after_the_warm_up(person: Person) -> None:
+    def list_signatures() -> dict[str, list[Any]]:
+        modules = [vars(module) for name, module in list(sys.modules.items()) if name.startswith("wepose_pin.")]
+        functions = [each for module in modules for each in module.values() if isinstance(each, Dispatcher)]
+        return {f"{each.__module__}.{each.__name__}": each.signatures for each in functions if each.signatures}
+
+    recording = simulate(person.lengths, seed=1, rate_hz=250.0, clasp_s=5.0, circles=0).recording("fast")
+    warm_up("amekf")
+    before = list_signatures()
+    assert len(before) > 10
+    setup = live.SensorSetup.from_recording(recording)
+    assert live.run_session(ReplaySource(recording, math.inf), setup).poses > 1000
+    assert list_signatures() == before
 
 
 def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: Simulation, tmp_path: Path) -> None:
