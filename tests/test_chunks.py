@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -112,12 +113,13 @@ def test_the_command_gives_the_same_folder(session: Path, person_folder: Path, t
     options = [session, "--subject", person_folder, "--covariance"]
     assert run("track", *options, "-o", tmp_path / "whole") == 0
     monkeypatch.setattr("wepose_pin.tracking.CHUNK_S", 10.0)
-    assert run("track", *options, "-o", tmp_path / "chunks") == 0
-    names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("whole", "chunks")]
+    places = tmp_path / "whole", tmp_path / os.fsdecode(b"chunks[1]\xff")  # which polars takes for no path
+    assert run("track", *options, "-o", places[1]) == 0
+    names = [sorted(path.name for path in place.iterdir()) for place in places]
     assert names[0] == names[1]
-    whole, chunks = (pl.read_parquet(tmp_path / name / "pose.parquet") for name in ("whole", "chunks"))
+    whole, chunks = (pl.read_parquet((place / "pose.parquet").read_bytes()) for place in places)
     assert chunks.equals(whole)
-    whole, chunks = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "chunks"))
+    whole, chunks = (json.loads((place / "summary.json").read_text()) for place in places)
     assert chunks | {"provenance": None} == whole | {"provenance": None}
 
 

@@ -225,6 +225,14 @@ def change_summary(folder: Path, **values: object) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
 
+def test_why_a_recording_has_no_repetitions_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=3.0)
+    change_summary(folder, repetitions={"source": "", "spans": [], "reason": "its 4 excursions are not alike"})
+    said = f"{folder}: no repetitions were found in it: its 4 excursions are not alike; there is: reach"
+    words = ["-o", str(tmp_path / "data"), "--format", "lerobot", "--episodes", "repetitions"]
+    assert_refused(capsys, [str(folder), *words], said)
+
+
 def change_table(folder: Path, change: pl.Expr) -> None:
     write_table(folder / "trajectory.parquet", pl.read_parquet(folder / "trajectory.parquet").with_columns(change))
 

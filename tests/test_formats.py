@@ -551,7 +551,10 @@ def test_a_description_beside_the_session_is_read(stated: str, tmp_path: Path) -
     ("change", "says"),
     [
         (("[xyz]", "[xyz"), r"lab\.toml: '.*' is no regular expression"),
-        (("(?P<axis>[xyz])", "[xyz]"), "no line of names with 't_ms' and columns of a signal|no sensor in it has"),
+        (("(?P<axis>[xyz])", "[xyz]"), r"lab\.toml: '.*' has no group 'axis'; write \(\?P<axis>\.\.\.\) around it"),
+        (("title", "units_before = '.+ (?P<unit>.+)'\ntitle"), r"lab\.toml: '.*' has no group 'name'; write"),
+        (("title", "units_before = '(?P<name>.+) .+'\ntitle"), r"lab\.toml: '.*' has no group 'unit'; write"),
+        (("title", "label_in_name = '.+_(.+)'\ntitle"), r"lab\.toml: '.*' has no group 'label'; write"),
         (("unit_s", "unit"), r"clock 1\.unit is not a known key; did you mean 'unit_s'"),
         (("[[clock]]", "[[accel]]"), "is not a known key"),
         (('"mg"', '"furlong"'), r"'chest fx' is in 'furlong'; there is: m/s\^2, g, mg"),

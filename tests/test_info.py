@@ -282,6 +282,13 @@ def test_what_cannot_be_read_is_said_and_a_session_still_proposed(
     assert "[sensors.torso]" in text
 
 
+def test_two_columns_of_times_of_one_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    content = table().write_csv().replace("time", "time,time", 1).splitlines()
+    rows = [content[0], *(f"{line.partition(',')[0]},{line}" for line in content[1:])]
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    assert "rate_hz = 100.0   # CHECK: no column looks like time" in info(capsys, tmp_path / "a.csv")
+
+
 def test_a_table_that_holds_no_sensor(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     pl.DataFrame({"time": TIME, "temperature": TIME}).write_csv(tmp_path / "a.csv")
     assert "no gyroscope and accelerometer" in info(capsys, tmp_path / "a.csv")

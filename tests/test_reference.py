@@ -368,6 +368,20 @@ def test_an_mvnx_is_a_reference(tmp_path: Path) -> None:
     reference = read_reference(mvnx(tmp_path, turning(100)))
     assert reference.up == "+z"
     assert {"torso", "left_forearm"} <= set(reference.quat_VT)
+    assert reference.diagnostics == ()
+
+
+def test_an_mvnx_without_its_t_pose_is_a_reference_with_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = mvnx(tmp_path, turning(100), t_pose=None)
+    labels = {"T8": "torso", "LeftUpperArm": "left_upper_arm", "LeftForeArm": "left_forearm"}
+    sensors = "".join(f'[sensors.{segment}]\nlabel = "{label}"\n' for label, segment in labels.items())
+    (tmp_path / "session.toml").write_text(f'[data]\nfile = "trial.mvnx"\n{sensors}')
+    assert run("track", tmp_path / "session.toml", "--no-report", "-o", tmp_path / "result") == 0
+    capsys.readouterr()
+    assert run("evaluate", tmp_path / "result", file, "--no-align") == 0
+    assert "warning: trial.mvnx has no frame of type tpose" in capsys.readouterr().err
 
 
 def test_a_real_mvnx_agrees_with_what_is_tracked_of_it(

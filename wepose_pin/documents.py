@@ -43,7 +43,7 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read: {failure.strerror}") from failure
     except ValueError as failure:
-        raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}") from failure
+        raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}; {what} is wanted here") from failure
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -463,7 +463,7 @@ def _report_full_disk(out: Path) -> Iterator[None]:
         yield
     except OSError as error:
         # An error of polars has the system's text but no number.
-        if error.errno in _FULL or "No space left" in str(error):
+        if error.errno in _FULL or any(os.strerror(number) in str(error) for number in _FULL):
             why = error.strerror or str(error)
             raise ExistingOutput(f"{out}: cannot be written: {why}; nothing was written") from error
         raise

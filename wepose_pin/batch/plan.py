@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from ..body import load_table
-from ..commands.command_line import parse
+from ..commands.command_line import APP, parse
 from ..data_tables import read_table
 from ..documents import Key, TomlTable, read_record, read_toml
 from ..errors import BadPlan, WeposeError, one_of
@@ -144,9 +145,11 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
     for step in [step for step in STEPS if step in table]:
         keys = table.table(step)
         steps[step] = options = dict(keys.values)
+        command = APP[step].default_command
+        assert command is not None
+        known = [name for name in inspect.signature(command).parameters if name not in (*STEPS[step], *_ITEM_OPTIONS)]
+        keys.allow(*known, *(["formats"] * (step == "export")))
         for name, value in options.items():
-            if name in _ITEM_OPTIONS:
-                raise BadPlan(f"{keys.at(name)} is not a known key; it follows from the session or its subject")
             if isinstance(value, str) and (path.parent / value).is_file():  # beside the plan, such as a protocol
                 options[name] = str((path.parent / value).absolute())
         if step not in ("calibrate", "track") and "track" not in steps:

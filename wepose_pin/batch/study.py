@@ -7,7 +7,7 @@ import io
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
@@ -71,11 +71,12 @@ def run_batch(
     plan = read_plan(plan_file, place)
     names = [item.name for items in plan for item in items]
     rows: dict[str, Row] = {}
-    with open_study(out):
+    count = workers or count_processors()  # before the processes of items get one thread each
+    with open_study(out), _one_thread():
         progress(0, 0, len(names))
         for items in plan:  # sessions need the calibrations
             if scheduler is None:
-                run = _run_here(items, workers or count_processors(), place, force)
+                run = _run_here(items, count, place, force)
             else:
                 run = _run_on_scheduler(items, scheduler, place, force)
             with contextlib.closing(run) as done:
@@ -91,12 +92,25 @@ def run_batch(
     return Study(plan, table, reused)
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that start within the block have one thread each."""
+    names = _ONE_THREAD.split()
+    before = {name: os.environ[name] for name in names if name in os.environ}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name in names:
+            del os.environ[name]
+        os.environ.update(before)
+
+
 def _run_here(items: Sequence[Item], count: int, place: str, force: bool) -> Generator[Row]:
     """Rows of the items, in the order in which they are done, from processes of this machine.
 
     A process that dies takes those beside it along: their items fail, and the others go on in new processes.
     """
-    os.environ.update(dict.fromkeys(_ONE_THREAD.split(), "1"))
     todo, before = list(items), set(active_children())
     while todo:
         pool = ProcessPoolExecutor(min(count, len(todo)), get_context("spawn"), _prepare_process)

@@ -106,6 +106,11 @@ def _plain(text: RenderableType | None, paragraphs: bool = False) -> str:
     return capture.get().strip() if paragraphs else " ".join(capture.get().split())
 
 
+def _refuse_nan(_kind: type, value: Any) -> None:
+    if isinstance(value, float) and value != value:
+        raise ValueError("a number is needed")
+
+
 APP = App(
     name="wepose",
     help="Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows the "
@@ -120,7 +125,7 @@ APP = App(
     help_formatter=PlainHelp(),
     group_arguments=Group("Arguments", sort_key=0),
     group_parameters=Group("Options", sort_key=1),
-    default_parameter=Parameter(negative_iterable=(), negative_none=()),
+    default_parameter=Parameter(negative_iterable=(), negative_none=(), validator=_refuse_nan),
 )
 for _number, (_name, _place) in enumerate(COMMANDS.items()):
     APP.command(_place, name=_name, help_epilogue="", sort_key=_number)

@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from ..diagnostics import Diagnostic
 from ..errors import BadOption, WrongOption
 from .options import MORE, File, Interval, Phase, Seconds
-from .output import print_table, progress_bar, say
+from .output import print_diagnostics, print_table, progress_bar, say
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation, Registration
@@ -75,10 +76,11 @@ def evaluate(
         file = load_session(truth, gaps=True).truth if truth.suffix == ".toml" or truth.is_dir() else truth
         if file is None:
             raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
-        up = None
+        up, diagnostics = None, tuple[Diagnostic, ...]()
         if is_reference(file):
             measured = read_reference(file, markers)
-            reference, up = Pose(measured.time, measured.quat_VT, measured.points), measured.up
+            reference = Pose(measured.time, measured.quat_VT, measured.points)
+            up, diagnostics = measured.up, measured.diagnostics
             fit = fit or ("segments" if measured.own_frames else "world")
         elif markers is not None:
             raise WrongOption("markers", str(markers), f"a .c3d or .trc as TRUTH; {file.name} has no markers")
@@ -97,6 +99,7 @@ def evaluate(
         else:
             reference = replace(reference, time=reference.time + (time_offset or 0.0))
             errors = compare(pose, reference, selected, model.table)
+    print_diagnostics(diagnostics)
     _print_errors(errors)
     return errors
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..diagnostics import Diagnostic
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, one_of
 
@@ -32,6 +33,7 @@ class Reference(NamedTuple):
     points: Mapping[str, np.ndarray]  # point → (n, 3) [m] in V; NaN: missing
     up: str | None = None  # the axis of V that is up; None: not known
     own_frames: bool = False  # frames are of another convention than ours
+    diagnostics: tuple[Diagnostic, ...] = ()
 
 
 class MarkerTable(NamedTuple):

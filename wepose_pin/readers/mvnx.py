@@ -67,16 +67,15 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
             f"{path}: no sensorAngularVelocity and sensorAcceleration; MVN writes them no more since 2018. Leave out "
             f"data.use, and its segments' orientations are read"
         )
-    diagnostics: tuple[Diagnostic, ...] = ()
+    diagnostics = _diagnose_frames(path, frames)
     signals: dict[str, dict[str, np.ndarray]]
     if raw and use != "orientation":
-        kind, (gyro, accel) = "raw", (frames.values[f"sensor{name}"] for name in ("AngularVelocity", "Acceleration"))
+        kind, diagnostics = "raw", ()
+        gyro, accel = (frames.values[f"sensor{name}"] for name in ("AngularVelocity", "Acceleration"))
         signals = {label: {"gyro": gyro[:, k], "accel": accel[:, k]} for k, label in enumerate(frames.sensors)}
     else:
         kind = "orientation"
         signals = {label: {"orientation": quat} for label, quat in _read_quats(frames).items()}
-        if frames.t_pose is None:
-            diagnostics = (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
     sensors = {
         label: DeviceSensor(frames.time, values, SEGMENT_OF[label])
         for label, values in signals.items()
@@ -92,7 +91,13 @@ def read_mvnx_reference(path: Path) -> Reference:
     """Read the segments' orientations and joints as a reference; its world has z up. Errors as `read_mvnx`."""
     frames = read_frames(path)
     quats = {SEGMENT_OF[label]: quat for label, quat in _read_quats(frames).items()}
-    return Reference(frames.time, quats, _find_joints(frames), "+z")
+    return Reference(frames.time, quats, _find_joints(frames), "+z", diagnostics=_diagnose_frames(path, frames))
+
+
+def _diagnose_frames(path: Path, frames: Frames) -> tuple[Diagnostic, ...]:
+    if frames.t_pose is not None:
+        return ()
+    return (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
 
 
 def read_subject(path: Path) -> Subject:

@@ -213,7 +213,9 @@ def _propose_time(proposal: Proposal, guess: Guess, arrays: ArrayFile | None) ->
             time = read_columns(table, [name], place, "time")[:, 0]
             break
     else:
-        _propose_rate(proposal, table.select(guess.times), () if arrays else read_first_lines(proposal.path))
+        _propose_rate(
+            proposal, table.select(*dict.fromkeys(guess.times)), () if arrays else read_first_lines(proposal.path)
+        )
         return
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0

@@ -19,7 +19,7 @@ from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED
 # Suffixes of data files.
 DATA = (
     *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto"),
-    *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".json", ".c3d", ".trc"),
+    *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".c3d", ".trc"),
 )
 SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
 # Keys of earlier versions, with their replacements.

@@ -186,6 +186,11 @@ def load_format(path: Path) -> TableFormat:
             re.compile(text)
         except (re.error, RecursionError, OverflowError) as error:
             raise BadSession(f"{path}: '{text}' is no regular expression: {error}") from None
+    needed = [(format.units_before, "name"), (format.units_before, "unit"), (format.label_in_name, "label")]
+    needed += [(each.columns[0], "axis") for own in signals.values() for each in own if len(each.columns) == 1]
+    for text, group in needed:
+        if text and group not in re.compile(text).groupindex:
+            raise BadSession(f"{path}: '{text}' has no group '{group}'; write (?P<{group}>...) around it")
     return format._replace(
         title=format.title or path.stem,
         needs=format.needs or " and ".join(signal for signal in AXES if signals[signal]),

@@ -225,9 +225,10 @@ def export(
             if provenance is not None:
                 write_provenance(partial, provenance)
         else:
+            if provenance is not None:  # entered first, so that an error in writing the file names that one
+                beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
             partial = files.enter_context(whole_file(file, force))
             if provenance is not None:
-                beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
                 write_provenance(beside.parent, provenance, beside.name)
         if kind.of == BODY:
             return Exported(name, kind.write(partial, results[0]) or [])

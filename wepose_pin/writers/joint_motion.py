@@ -52,6 +52,7 @@ class JointMotion:
     phases: Mapping[str, Intervals] = field(default_factory=dict)  # `REPETITIONS` are those of the movement
     begin: int = 0  # the first sample after the robot's approach
     source: str = ""  # name of the recording that a robot follows
+    no_repetitions: str = ""  # why none were found in it
 
     @property
     def rate_hz(self) -> float:
@@ -191,8 +192,9 @@ def read_joint_motion(folder: Path) -> JointMotion:
         place = np.array([float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")])
         posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
         approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
-        spans = (summary.get(REPETITIONS) or {}).get("spans", ())
-        phases = read_phases(summary) | {REPETITIONS: tuple((float(begin), float(end)) for begin, end in spans)}
+        repetitions = summary.get(REPETITIONS) or {}
+        spans = tuple((float(begin), float(end)) for begin, end in repetitions.get("spans", ()))
+        phases = read_phases(summary) | {REPETITIONS: spans}
     columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
     values = read_columns(read_table(file), columns, str(file), str(file))
     time = values[:, 0]
@@ -217,6 +219,7 @@ def read_joint_motion(folder: Path) -> JointMotion:
         phases=phases,
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
         source=source,
+        no_repetitions=str(repetitions.get("reason") or ""),
     )
 
 

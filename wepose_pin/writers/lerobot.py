@@ -99,8 +99,9 @@ def _list_episodes(
         text += f", {by}"
     parts = [part for span in spans if (part := motion.samples(span)).stop - part.start >= 2]
     if not parts:
-        missing = "no repetitions were found in it" if by == REPETITIONS else "it has no such phase"
-        reason = "the trajectory follows none of it" if spans else missing
+        reason = "the trajectory follows none of it" if spans else "it has no such phase"
+        if by == REPETITIONS and not spans:
+            reason = ": ".join(filter(None, ("no repetitions were found in it", motion.no_repetitions)))
         known = [name for name, intervals in motion.phases.items() if intervals and name != by]
         choices = one_of(known, by) if known else "leave --episodes out"
         raise WrongOption("episodes", by, f"{motion.where}: {reason}; {choices}")

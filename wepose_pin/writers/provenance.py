@@ -142,7 +142,7 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
 def write_provenance(folder: Path, provenance: Mapping[str, Any], name: str = "provenance.json") -> None:
     """Write a provenance as a file of its own into a folder."""
     text = json.dumps(provenance, indent=1, ensure_ascii=False)
-    (folder / name).write_text(f"{text}\n", encoding="utf-8")
+    (folder / name).write_text(f"{text}\n", encoding="utf-8", errors="backslashreplace")  # of a path not in UTF-8
 
 
 # Folders that hold an earlier result, or files of the user ---------------------------------------------------------

@@ -6,9 +6,9 @@ With a body other than the upper body also ``model.toml``, its table; of a mecha
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
 import json
+import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import polars as pl
@@ -72,10 +72,15 @@ def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = 
             files[0].rename(folder / name)
             continue
         try:
-            with (folder / name).open("wb") as out:
-                pl.scan_parquet(files).sink_parquet(out, row_group_size=ROW_GROUP)
-        except pl.exceptions.PolarsError as error:  # which has the system's text and no number
-            raise OSError(errno.ENOSPC, str(error).splitlines()[0]) from error
+            with contextlib.ExitStack() as stack:
+                out = stack.enter_context((folder / name).open("wb"))
+                # Of a path polars takes [ and * for a pattern, and only UTF-8.
+                opened: list[IO[bytes]] = [stack.enter_context(file.open("rb")) for file in files]
+                pl.scan_parquet(opened).sink_parquet(out, row_group_size=ROW_GROUP)
+        except pl.exceptions.PolarsError as error:
+            if number := re.search(r"\(os error (\d+)\)", str(error)):  # polars has the system's error as text
+                raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+            raise
         for file in files:
             file.unlink()
 
