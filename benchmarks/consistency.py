@@ -67,7 +67,7 @@ def measure_person(seed: int, preset: str, protocol: str, seconds: float) -> dic
         "seed": seed,
         "quality": assess(calibration).quality,
         **compare_subject(calibration.subject, person, simulation),
-        **compare_pose(track(recording, calibration.subject), simulation),
+        **compare_pose(track(recording, calibration.subject, accept_failed=True), simulation),
     }
 
 

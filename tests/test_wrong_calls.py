@@ -262,5 +262,7 @@ def test_a_pose_or_a_truth_of_nan_is_refused() -> None:
     with pytest.raises(BadData, match="NaN in all samples"):
         wp.joint_angles(unknown)
     for pair in ((pose, unknown), (unknown, pose)):
-        with pytest.raises(BadData, match="no point in common, or one of the two is NaN"):
+        with pytest.raises(BadData, match=r"no orientation of a segment is known to both at a time: of .* NaN"):
             wp.evaluate(*pair)
+    with pytest.raises(BadData, match=r"no position of a point is known to both at a time: of .* NaN"):
+        wp.evaluate(pose, replace(pose, points=points))

@@ -50,11 +50,6 @@ def _join(key: str, name: str) -> str:
     return f"{key}/{name}" if key else name
 
 
-def _are_rows(values: list[Any]) -> bool:
-    """Whether they are mappings with the same keys."""
-    return bool(values) and all(isinstance(each, Mapping) and each.keys() == values[0].keys() for each in values)
-
-
 def _array(value: Any) -> np.ndarray | None:
     try:
         array = np.asarray(value)

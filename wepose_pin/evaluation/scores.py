@@ -190,10 +190,15 @@ def evaluate(
             known = np.isfinite(on_limb).all(axis=1)
             if known.any():
                 position_on_limb[point] = position_error(on_limb[known])
+    for kind, common, errors in (
+        ("orientation of a segment", pose.quat_WL.keys() & truth.quat_WL.keys(), attitude),
+        ("position of a point", pose.points.keys() & truth.points.keys(), position),
+    ):
+        if common and not errors:
+            raise BadData(f"no {kind} is known to both at a time: of {', '.join(sorted(common))} one of the two is NaN")
     if not attitude and not position:
         raise BadData(
-            "pose and reference have no segment and no point in common, or one of the two is NaN; columns as in "
-            "pose.parquet are needed"
+            "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
         )
     joints = _joint_errors(pose, inside, true_WL)
     uncertainties = attitude_uncertainty, position_uncertainty

@@ -206,7 +206,7 @@ class Stage(ABC):
             samples = self.source.read(self.READ_TIMEOUT_S)
             if samples is None:
                 return
-            self.process(samples)
+            self.process([chunk for chunk in samples if len(chunk.time)])
             for request in [request for output in self.outputs for request in output.take_requests()]:
                 if request == QUIT:
                     return

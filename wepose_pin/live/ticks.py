@@ -35,7 +35,7 @@ class SampleCounter:
 
     def __init__(self) -> None:
         self.missing, self.newest = 0, -math.inf  # samples; time [s]
-        self.last_second: deque[float] = deque()  # times [s] of the samples, those before dropped by who counts them
+        self.last_second: deque[float] = deque()  # times [s] of the samples in the second that ends at the last one
         self._first: list[float] = []  # times [s], until the step is known
         self._step = math.inf  # [s]
 
@@ -49,10 +49,12 @@ class SampleCounter:
                 times, self.newest = self._first, self._first[0]
                 self.last_second.clear()
         for t in times:
-            step = t - self.newest
-            if math.isnan(step):
+            if not math.isfinite(t):
                 continue
+            step = t - self.newest
             self.last_second.append(t)
+            while not 0.0 <= t - self.last_second[0] < 1.0:  # older, or of before the clock was set back
+                self.last_second.popleft()
             if -JUMP_S < step < 0.0:  # it was overtaken, and taken for a lost one
                 self.missing -= self.missing > 0
                 continue
@@ -78,12 +80,14 @@ class SensorMonitor:
         self.wrong_unit = ""  # a sentence on sensors whose rates contradict gravity; empty: there is none
         self._source = source
         self.sending: dict[str, SampleCounter] = {}  # of the sensors that have sent something
+        self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
         self._recent: dict[str, list[Samples]] = {}  # of which rates are compared with gravity
 
     def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
         """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
         for chunk in samples:
             self.sending.setdefault(chunk.sensor, SampleCounter()).push(chunk.time)
+            self._arrived[chunk.sensor] = self._source.clock()
             if chunk.sensor in unchecked:
                 self._recent.pop(chunk.sensor, None)
             else:
@@ -95,15 +99,12 @@ class SensorMonitor:
         return [name for name in sensors if name not in sending or now - sending[name].newest > silence_s]
 
     def update(self, now: float) -> dict[str, SensorStatus]:
-        """Rate over the last second, missing samples and battery of each sensor; looks for a wrong unit as well."""
+        """Rate over each sensor's last second, missing samples and battery; looks for a wrong unit as well."""
         self.wrong_unit, statuses = self._find_wrong_unit(), {}
         for name, counter in self.sending.items():
-            while counter.last_second and counter.last_second[0] <= now - 1.0:
-                counter.last_second.popleft()
+            rate_hz = float(len(counter.last_second)) if now - self._arrived[name] < 1.0 else 0.0
             battery = self._source.batteries.get(name, math.nan)
-            statuses[name] = SensorStatus(
-                name, float(len(counter.last_second)), missing=counter.missing, battery=battery
-            )
+            statuses[name] = SensorStatus(name, rate_hz, missing=counter.missing, battery=battery)
         return statuses
 
     def _find_wrong_unit(self) -> str:

@@ -261,7 +261,6 @@ class CommandStream:
         self.robot, self.options = robot, options or StreamOptions()
         self.dt = 1.0 / self.options.rate_hz
         self._omega = 2.0 * np.pi * SMOOTHING_HZ
-        self.delay_s = 2.0 / self._omega  # [s] of the low-pass
         collision = CollisionModel(robot)
         self._controller = QpController(robot, collision, self.dt)
         self.state = JointState.at_rest(robot.rest)  # at the last command

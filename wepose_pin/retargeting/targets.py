@@ -150,15 +150,16 @@ def check_person_arms(
 ) -> None:
     """Raise `BadData` where an arm that the robot follows is not among the segments and points (None: all)."""
     table, missing = table or load_table(), {}
-    for side in (arm.side for arm in robot.arms):
+    sides = {arm.side for arm in robot.arms} | {table.side(tip) for tip in table.drawn_limbs}
+    for side in sides.intersection(robot.map.arms):
         limb = find_person_arm(table, side)
         needed = (str(limb.base), *limb.segments[:-1])
         missing[side] = [name for name in needed if name not in segments]
         missing[side] += [name for name in limb.points if points is not None and name not in points]
     text = "; ".join(
-        f"{robot.map.name}'s {side} arm follows {', '.join(names)}, which the sensors do not measure"
-        for side, names in missing.items()
-        if names
+        f"{robot.map.name}'s {arm.side} arm follows {', '.join(missing[arm.side])}, which the sensors do not measure"
+        for arm in robot.arms
+        if missing[arm.side]
     )
     if text:
         usable = [f"choose arm {side}" for side, names in missing.items() if not names]

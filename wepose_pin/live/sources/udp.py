@@ -295,9 +295,9 @@ def _decode_line(
     """The samples of a line of JSON, and their units."""
     try:
         message = json.loads(line)
-        sensor, battery = message["sensor"], float(message.get("battery", math.nan))
+        sensor, battery = message["sensor"], _read_numbers(message.get("battery", math.nan)).item()
         stated = {key: str(message.get(key, unit)) for key, unit in units.items()}
-        time, gyro, accel = (np.array(message[key], dtype=float) for key in ("t", "gyro", "accel"))
+        time, gyro, accel = (_read_numbers(message[key]) for key in ("t", "gyro", "accel"))
         if not (time.size and gyro.shape == accel.shape == (*time.shape, 3)) or battery < 0.0 or battery > 1.0:
             raise ValueError("not as it should be")
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
@@ -309,6 +309,14 @@ def _decode_line(
         if stated[key] not in known:
             raise Malformed(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
     return Batch(sensor, time.reshape(-1), np.concatenate([gyro, accel], axis=-1).reshape(-1, 6), battery), stated
+
+
+def _read_numbers(value: Any) -> np.ndarray:
+    """A number of JSON, or lists of them; texts and booleans, which NumPy would convert, are refused."""
+    array = np.array(value, dtype=object)
+    if not all(type(each) in (int, float) for each in array.flat):
+        raise ValueError("not all are numbers")
+    return array.astype(float)
 
 
 KIND = SourceKind("udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]", open_spec)
