@@ -194,7 +194,7 @@ def test_a_session_that_lacks_sensors_says_what_is_not_known(
 @pytest.mark.kill
 @pytest.mark.parametrize("seconds", [0.8, 1.6, 2.4])
 def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: float) -> None:
-    """Ctrl-C, and the SIGTERM of a cluster, at any time: exit 130 and no trace, or done before it came."""
+    """Ctrl-C, and the SIGTERM of a cluster, at any time: exit 130 and no trace, or what was written before is said."""
     command = [sys.executable, "-m", "wepose_pin", "calibrate", str(session), "-o", str(tmp_path / "subject")]
     for number in (signal.SIGINT, signal.SIGTERM):
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
@@ -203,8 +203,10 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         _, printed = process.communicate(timeout=60)
         left = {path.name for path in tmp_path.iterdir()} - {"session.toml", "recording.parquet", "truth.parquet"}
         if process.returncode == 130:
-            assert left == set()
+            assert left == ({"subject"} if "subject was written before" in printed else set()), printed
             assert printed.count("Traceback") == 0
+            if left:
+                break
         else:
             assert left <= {"subject"}
             break
