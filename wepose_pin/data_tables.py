@@ -159,7 +159,7 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
         if bad.any():
             row = int(bad.arg_max() or 0)
             text = stripped[row]
-            numeric = re.fullmatch(r"-?\d*,\d*", text)
+            numeric = re.fullmatch(r"-?(\d+,\d*|,\d+)", text)
             right = f"write decimals with a point: {text.replace(',', '.')}" if numeric else "it must be a number"
             raise BadData(f"{file}: column '{name}' holds text in row {row + 1}: '{text[:40]}'; {right}")
     elif not series.dtype.is_numeric() and series.dtype != pl.Null:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
+from numbers import Real
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
@@ -339,8 +340,9 @@ def format_record(record: Any, unread: Mapping[str, Sequence[str]] | None = None
 def _format_mapping(
     key: Key, values: Mapping[str, Any], comment: str, unread: Mapping[str, Sequence[str]]
 ) -> list[str]:
-    if all(isinstance(value, float | str) for value in values.values()):
-        own = [f"{toml_key(name)} = {_format_field(key, value)}" for name, value in values.items()]
+    if all(isinstance(value, Real | str) for value in values.values()):
+        numbers = {name: value if isinstance(value, str) else float(value) for name, value in values.items()}
+        own = [f"{toml_key(name)} = {_format_field(key, value)}" for name, value in numbers.items()]
         return ["", f"[{key.name}]{comment}", *own]
     lines = []
     for name, value in values.items():

@@ -187,7 +187,11 @@ def _find_cause(calibration: Calibration, rotations: Mapping[str, float], spine:
     table = calibration.problem.model.table
     if not rotations:
         return None
-    own = [angle for name, angle in rotations.items() if table.segments[name].spine == spine]
+    own = [
+        angle
+        for name, angle in rotations.items()
+        if (name == table.reference if spine else not table.segments[name].spine)
+    ]
     variant, enough = ("spine", ENOUGH_SPINE) if spine else ("limbs", ENOUGH_LIMBS)
     if own and min(own) < enough and not table.is_mechanism:
         return Diagnostic("motion-too-small", WARNING, "", min(own), float(enough), {"variant": variant})
