@@ -16,6 +16,7 @@ from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import build_pose_table
 from wepose_pin.body.subject import Subject
 from wepose_pin.calibration import calibrate
+from wepose_pin.data_tables import read_table
 from wepose_pin.errors import BadOption
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
@@ -117,7 +118,7 @@ def test_the_command_gives_the_same_folder(session: Path, person_folder: Path, t
     assert run("track", *options, "-o", places[1]) == 0
     names = [sorted(path.name for path in place.iterdir()) for place in places]
     assert names[0] == names[1]
-    whole, chunks = (pl.read_parquet((place / "pose.parquet").read_bytes()) for place in places)
+    whole, chunks = (read_table(place / "pose.parquet") for place in places)
     assert chunks.equals(whole)
     whole, chunks = (json.loads((place / "summary.json").read_text()) for place in places)
     assert chunks | {"provenance": None} == whole | {"provenance": None}

@@ -388,7 +388,7 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
         (["-o", "x.trc", "--rate-hz", "0"], "--rate-hz 0: between 1 and 10000 samples a second"),
         (["-o", "x.trc", "--rate-hz", "nan"], "--rate-hz nan: between 1 and 10000"),
         (["-o", "x.urdf", "--rate-hz", "50"], "--rate-hz 50.0: not of format urdf; there is no motion in it"),
-        (["-o", "no/x.trc"], "no/x.trc.provenance.json: not a file that can be written"),
+        (["-o", "no/x.trc"], "no/x.trc: not a file that can be written"),
     ],
 )
 def test_wrong_options_take_one_line(

@@ -43,8 +43,8 @@ def read_table(path: Path) -> pl.DataFrame:
         The file is damaged, or has rows of different lengths.
     """
     if _is_parquet(path):
-        with library_errors(path, "a Parquet file"):
-            return pl.read_parquet(path)
+        with library_errors(path, "a Parquet file"), path.open("rb") as file:  # of a path polars takes [ for a pattern
+            return pl.read_parquet(file)
     layout = read_layout(path)
     body = read_body(path, layout.head_lines)
     names = [
@@ -71,8 +71,8 @@ def read_body(path: Path, head_lines: int) -> bytes:
 def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
     """Read the names of a table's columns, and the units of those that have one in a line of a CSV."""
     if _is_parquet(path):
-        with library_errors(path, "a Parquet file"):
-            return list(pl.read_parquet_schema(path)), {}
+        with library_errors(path, "a Parquet file"), path.open("rb") as file:
+            return list(pl.read_parquet_schema(file)), {}
     layout = read_layout(path)
     return list(layout.names), dict(zip(layout.names, layout.units, strict=False))
 

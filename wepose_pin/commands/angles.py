@@ -106,7 +106,8 @@ def angles(
             for name, table in tables.items():
                 if len(table):
                     rounded = table.with_columns(selectors.float().round(DECIMALS))
-                    rounded.fill_nan(None).write_csv(folder / f"{name}.csv")
+                    with (folder / f"{name}.csv").open("wb") as file:  # polars takes only a path in UTF-8
+                        rounded.fill_nan(None).write_csv(file)
             figures = report.draw_figures(movements)
             for name, figure in figures.items():
                 (folder / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")

@@ -205,7 +205,8 @@ def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
     table = build_table(trajectory)
     (folder / ROBOT_URDF).write_text(resolve_meshes(trajectory.robot.map.urdf), encoding="utf-8")
     write_table(folder / TRAJECTORY, table)
-    table.write_csv(folder / "trajectory.csv", float_precision=DIGITS)
+    with (folder / "trajectory.csv").open("wb") as file:  # polars takes only a path in UTF-8
+        table.write_csv(file, float_precision=DIGITS)
     (folder / "joint_trajectory.json").write_text(_format_joint_trajectory(trajectory), encoding="utf-8")
 
 

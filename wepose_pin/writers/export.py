@@ -16,6 +16,7 @@ from ..arguments import check_arguments
 from ..assets import find_plugins, load_plugin
 from ..body.kinematics import build_pose_table, find_samples
 from ..diagnostics import Diagnostic, notebook_html
+from ..documents import check_file as check_output
 from ..documents import whole_file
 from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file
@@ -72,7 +73,8 @@ def write_urdf(file: Path, result: Result) -> None:
 def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
     """Write every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
     rows, diagnostics = build_table(motion)
-    rows.fill_nan(None).write_csv(path)
+    with path.open("wb") as file:  # polars takes only a path in UTF-8
+        rows.fill_nan(None).write_csv(file)
     return diagnostics
 
 
@@ -225,6 +227,7 @@ def export(
             if provenance is not None:
                 write_provenance(partial, provenance)
         else:
+            check_output(file, force)
             if provenance is not None:  # entered first, so that an error in writing the file names that one
                 beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
             partial = files.enter_context(whole_file(file, force))
