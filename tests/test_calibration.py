@@ -133,6 +133,29 @@ def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(e
         assert again.subject.lengths[name] == pytest.approx(1.1 * calibration.subject.lengths[name], rel=1e-3)
 
 
+@pytest.mark.monte_carlo
+def test_the_standard_deviations_are_honest() -> None:
+    """MTi-3 noise, real filtering, a measured shoulder width: errors over their standard deviations, 12 people."""
+    z, chi2 = [], []
+    for seed in range(12):
+        person = simulate_person(100 + seed)
+        simulation = simulate(person.lengths, seed=seed, circles=0)
+        subject = calibrate(
+            simulation.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
+        ).subject
+        names = [name for name in LENGTHS if name != "trunk"]
+        error = np.array([subject.lengths[name] - person.lengths[name] for name in names])
+        z.append(error / [subject.std(name) for name in names])
+        chi2.append(error @ np.linalg.solve(subject.lengths_covariance(names), error))
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    print("chi2 of 7 lengths jointly:", np.round(chi2, 1))
+    print("rms of error/std:", dict(zip(names, rms.round(2), strict=True)))
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
+    # Jointly, narrow combinations such as left minus right included; 7 is right, 24 is passed by one in a thousand.
+    assert 2.0 < np.mean(chi2) < 10.0
+    assert np.max(chi2) < 24.0
+
+
 def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
     subject = calibrate(recording, prior=person.prior).subject

@@ -318,8 +318,9 @@ def test_wrong_input_is_named() -> None:
     with pytest.raises(BadData, match=r"must both be \(n, 3\)"):
         estimate_orientation(gyro, gyro[:50], RATE, static=(0, 0.5))
     noise = estimate_noise(*measured(np.random.default_rng(0), 2.0)[:2], RATE)
-    with pytest.raises(BadOption, match="tilt_std"):
-        SmekfParams(tilt_std=-1.0)
+    for params, name in ((SmekfParams, "tilt_std"), (AmekfParams, "gyro_range"), (GdcParams, "gain")):
+        with pytest.raises(BadOption, match=f"{name} = -1.0: a (finite )?number"):
+            params(**{name: -1.0})
     with pytest.raises(BadData, match="as many"):
         Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0])).run(np.zeros((5, 3)), np.zeros((5, 3)), True)
     with pytest.raises(BadData, match="finite"):

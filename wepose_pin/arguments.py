@@ -24,22 +24,25 @@ from .errors import BadData, BadOption, one_of
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers above `low`, or at least `low` where `closed`, and at most `high`."""
+    """Numbers above `low`, or at least `low` where `closed`, and at most `high`; finite unless `infinite`."""
 
     low: float
     closed: bool
     high: float = math.inf
+    infinite: bool = False
 
     def __str__(self) -> str:
         up_to = "" if math.isinf(self.high) else f", up to {self.high:g}"
         return f"{'at least' if self.closed else 'above'} {self.low:g}{up_to}"
 
     def __contains__(self, value: float) -> bool:
-        return (self.low <= value if self.closed else self.low < value) and value <= self.high and value < math.inf
+        above = self.low <= value if self.closed else self.low < value
+        return above and value <= self.high and (value < math.inf or self.infinite)
 
 
 Positive = Annotated[float, Range(0.0, closed=False)]
 NonNegative = Annotated[float, Range(0.0, closed=True)]
+PositiveOrInfinite = Annotated[float, Range(0.0, closed=False, infinite=True)]
 Count = Annotated[int, Range(0.0, closed=True)]
 
 
@@ -76,8 +79,10 @@ def _find_rules(hint: Any) -> tuple[_Rule, ...]:
         return tuple(rule for part in parts for rule in _find_rules(part))
     if origin is Annotated:
         limits = next((note for note in parts[1:] if isinstance(note, Range)), None)
-        rules, words = _find_rules(parts[0]), f"a finite number {limits}"
-        return rules if limits is None else tuple(rule._replace(limits=limits, words=words) for rule in rules)
+        if limits is None:
+            return _find_rules(parts[0])
+        words = f"a {'' if limits.infinite else 'finite '}number {limits}"
+        return tuple(rule._replace(limits=limits, words=words) for rule in _find_rules(parts[0]))
     if origin is Literal:
         return (_Rule(str, f"one of {', '.join(parts)}", choices=parts),)
     kind, words = _KINDS.get(origin or hint) or (origin or hint, f"an object of class {(origin or hint).__name__}")

@@ -37,8 +37,8 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
         It is not TOML; an error of the kind `error`.
     """
     if not path.is_file():
-        found = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
-        raise MissingFile(f"{path}: {found}; {what} is wanted here")
+        state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
+        raise MissingFile(f"{path}: {state}; {what} is wanted here")
     try:
         return parse_toml(path.read_bytes().decode("utf-8-sig"))
     except OSError as failure:
@@ -88,8 +88,8 @@ class TomlTable:
         """Return the table of that name; an error without it and without `default`."""
         value = self.values.get(key, default)
         if not isinstance(value, Mapping):
-            found = "is missing" if value is None else f"= {value!r} is not a table"
-            raise self.error(f"{self.at(key)} {found}; a table [{self.place}{key}] is needed")
+            state = "is missing" if value is None else f"= {value!r} is not a table"
+            raise self.error(f"{self.at(key)} {state}; a table [{self.place}{key}] is needed")
         return replace(self, values=value, place=f"{self.place}{key}.")
 
     def entries(self, key: str) -> list[TomlTable]:
@@ -118,8 +118,8 @@ class TomlTable:
         """Return one of the choices."""
         choices, value = list(choices), self.text(key, default)
         if value not in choices:
-            found = "is missing" if value is None else f"= '{value}' is not known"
-            raise self.error(f"{self.at(key)} {found}; {one_of(choices, value)}")
+            state = "is missing" if value is None else f"= '{value}' is not known"
+            raise self.error(f"{self.at(key)} {state}; {one_of(choices, value)}")
         return value
 
     def flag(self, key: str) -> bool:
@@ -143,8 +143,8 @@ class TomlTable:
         value = self.values.get(key)
         names = [name for name in value if isinstance(name, str)] if isinstance(value, list) else []
         if names != value or len(names) != count or len(set(names)) < count:
-            found = "is missing" if value is None else f"= {_format_value(value)}"
-            raise self.error(f"{self.at(key)} {found}; a list of {count} different column names is needed")
+            state = "is missing" if value is None else f"= {_format_value(value)}"
+            raise self.error(f"{self.at(key)} {state}; a list of {count} different column names is needed")
         return names
 
 
@@ -251,8 +251,8 @@ def read_record(
     return kind(**values)
 
 
-def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]], found: Any = None) -> str:
-    """Describe what is right in place of `found`, with its verb, as "two numbers [mm] from 0 to 90 are"."""
+def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]], value: Any = None) -> str:
+    """Describe what is right in place of `value`, with its verb, as "two numbers [mm] from 0 to 90 are"."""
     parts = get_args(value_type) or (value_type,)
     if parts[0] is not float:
         choices = f" ({one_of(known.get(key.of, key.words))})" if key.of or key.words else ""
@@ -260,7 +260,7 @@ def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]], f
         return "three names are" if len(parts) == 3 else f"{one}{choices} is"
     unit = f" [{key.unit.replace('_', '/')}]" if key.unit else ""
     limits = f" from {key.least:g}{f' to {key.most:g}' if key.most < 1e6 else ' on'}" if key.least > -1e6 else ""
-    numbers = [each for each in (found if isinstance(found, list | tuple) else (found,)) if is_number(each)]
+    numbers = [each for each in (value if isinstance(value, list | tuple) else (value,)) if is_number(each)]
     if any(each > key.most or (each < key.least and not limits) for each in numbers):
         limits = f" from {key.least:g} to {key.most:g}"
     return f"{_COUNTS[len(parts)]}{unit}{limits} {'are' if len(parts) > 1 else 'is'}"
@@ -309,8 +309,8 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
         each = [_to_si(key, number) for number in numbers if is_number(number) and key.least <= number <= key.most]
         if len(each) == len(numbers) == max(len(parts), 1):
             return tuple(each) if parts else each[0]
-    found = f" = {_format_value(value)};" if key.name in table else " is missing;"
-    raise table.error(f"{table.at(key.name)}{found} {_describe(value_type, key, known, value)} needed")
+    state = f" = {_format_value(value)};" if key.name in table else " is missing;"
+    raise table.error(f"{table.at(key.name)}{state} {_describe(value_type, key, known, value)} needed")
 
 
 def _to_si(key: Key, value: float) -> float:

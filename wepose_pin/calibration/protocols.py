@@ -26,7 +26,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..assets import asset
-from ..body import BodyTable
+from ..body import BodyTable, list_breadths
 from ..body.mounts import PALM_SLIP_STD
 from ..body.table import check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
@@ -143,6 +143,9 @@ class Protocol:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
         check_segments(table, (*named, *self.needs), where, BadOption)
+        measured = self.measured_example.partition("=")[0]
+        if measured and measured not in (*table.lengths, *list_breadths(table)):
+            raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 
 def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:

@@ -187,11 +187,9 @@ def _find_cause(calibration: Calibration, rotations: Mapping[str, float], spine:
     table = calibration.problem.model.table
     if not rotations:
         return None
-    own = [
-        angle
-        for name, angle in rotations.items()
-        if (name == table.reference if spine else not table.segments[name].spine)
-    ]
+    in_closures = group_lengths(calibration.problem.conditions, calibration.problem.model.lengths)
+    limbs = [name for name in in_closures if not table.segments[name].spine]
+    own = [rotations[name] for name in ([table.reference] if spine else limbs) if name in rotations]
     variant, enough = ("spine", ENOUGH_SPINE) if spine else ("limbs", ENOUGH_LIMBS)
     if own and min(own) < enough and not table.is_mechanism:
         return Diagnostic("motion-too-small", WARNING, "", min(own), float(enough), {"variant": variant})

@@ -31,6 +31,9 @@ from .weights import (
     solve_reweighted,
 )
 
+# [m] to which a length between joint centres is known at best: of simulated people with exact hinges, sums and
+# differences of lengths that were stated to 0.1 mm are off by 0.2 to 1 mm.
+JOINT_CENTRE_STD = 0.0003
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
 MOST_LAG_STD = 0.15  # [rad/rad] from which on the motion does not show how far a sensor lags behind a twist
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
@@ -257,6 +260,9 @@ def _project_to_subject(
         own[2, layout.heading[i]] = 1.0
         T[K + 3 * i : K + 3 * i + 3] = problem.start_pose.rotation(name).T @ own
     projected = T @ covariance @ T.T
+    if not problem.model.table.is_mechanism:
+        shown = [k for k, name in enumerate(layout.lengths) if name in problem.lengths_in_closures]
+        projected[shown, shown] += JOINT_CENTRE_STD**2
     known = {} if problem.recording.remounted else problem.prior.mounts
     segments = problem.model.table.segments
     tissue = {name: scatter * np.array(segment.soft_tissue.std) for name, segment in segments.items()}

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arguments import NonNegative, Positive, check_fields
+from ..arguments import NonNegative, Positive, PositiveOrInfinite, check_fields
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
@@ -113,7 +113,7 @@ class AmekfParams:
     motion_bias_walk: NonNegative = 5e-5  # [rad/s/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg
     accel_bias_walk: NonNegative = 1e-4  # [m/s²/√s]
-    gyro_range: float = np.inf  # [rad/s] full scale; a saturated sample's rotation is as uncertain as a lost one
+    gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it a rotation is as uncertain as a lost one
     lost_force_std: NonNegative = 5.0  # [m/s²] of the unknown acceleration while accel is lost (NaN)
 
     def __post_init__(self) -> None:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..arguments import NonNegative, check_fields
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import derivative, rotate_by_vector, up_in_sensor
@@ -26,15 +27,21 @@ from .base import OrientationFilter, make_record
 class NcfParams:
     """Gains as tuned on many recordings by Laidig and Seel 2023 (VQF, Information Fusion 91, the Mahony baseline)."""
 
-    proportional: float = 0.74  # [1/s] k_P
-    integral: float = 0.0012  # [1/s²] k_I
+    proportional: NonNegative = 0.74  # [1/s] k_P
+    integral: NonNegative = 0.0012  # [1/s²] k_I
+
+    def __post_init__(self) -> None:
+        check_fields(self, "")
 
 
 @dataclass(frozen=True)
 class GdcParams:
     """The gain that Madgwick 2011 found best for an IMU."""
 
-    gain: float = 0.033  # [1/s] β
+    gain: NonNegative = 0.033  # [1/s] β
+
+    def __post_init__(self) -> None:
+        check_fields(self, "")
 
 
 @inlined

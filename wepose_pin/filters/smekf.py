@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arguments import NonNegative, check_fields
+from ..arguments import NonNegative, PositiveOrInfinite, check_fields
 from ..compilation import fma, inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
@@ -46,7 +46,7 @@ class SmekfParams:
     tilt_std: NonNegative = ACCEL_BIAS_STD  # [rad] of roll and pitch at the start
     static_turn_noise: NonNegative = STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical
     gyro_scale_std: NonNegative = 0.002  # of the gyroscope's scale, which no static phase shows
-    gyro_range: float = np.inf  # [rad/s]; a sample at it is used, and the covariance grows by what may be beyond
+    gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
 
     def __post_init__(self) -> None:
         check_fields(self, "")

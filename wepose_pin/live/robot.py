@@ -198,13 +198,13 @@ def read_robot(name: str) -> RobotOptions:
     keys = TomlTable(values, name, error=BadOption)
     keys.allow("robot", "arm", "to", *MARGINS, *TIMING)
     robot = str(keys.text("robot", None))
-    beside = file.parent / robot
+    neighbour = file.parent / robot
     margins, timing = (
         {key: float(keys.number(key, None) or 0.0) for key in names if key in keys} for names in (MARGINS, TIMING)
     )
     sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
     try:
-        chosen = load_robot(find_map(str(beside) if beside.is_file() else robot), sides, LimitMargins(**margins))
+        chosen = load_robot(find_map(str(neighbour) if neighbour.is_file() else robot), sides, LimitMargins(**margins))
         return RobotOptions(chosen, str(values.get("to", PORT)), StreamOptions(**timing))
     except WrongOption as error:
         raise BadOption(f"{name}: {error.name.replace('-', '_')} = {error.value}: {error.needed}") from None

@@ -24,7 +24,7 @@ from .ticks import StillPose, check_units
 
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
 GET_READY_S = 8.0  # [s] to leave the keyboard and take the pose
-MOST_LOSS_S = 2.0  # [s] of a silent sensor after which its heading has to be found anew
+MOST_LOSS_S = 2.0  # [s] of a silent sensor after which its heading has to be estimated anew
 SENTENCE_S = 9.0  # [s] for which each sentence of an instruction stands
 FIRST_ESTIMATE_S, ESTIMATE_PERIOD_S = 12.0, 4.0  # [s] of motion before the first estimate, and between two
 FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
@@ -152,14 +152,14 @@ def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
                 moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
                 moved = moved if pose.state == "moved" else ""
                 if row is not None:
-                    held = float(ticks.time[row]) - seconds + 1.0 / attempt.stream.rate_hz, float(ticks.time[row])
+                    span = float(ticks.time[row]) - seconds + 1.0 / attempt.stream.rate_hz, float(ticks.time[row])
                     try:
-                        check_units(replace(attempt.recording(), phases={"static": (held,)}), guide.source)
+                        check_units(replace(attempt.recording(), phases={"static": (span,)}), guide.source)
                     except BadData as error:
                         reason = str(error)
                         break
-                    attempt.mark("begin", phase="start", time=held[0])
-                    attempt.mark("end", phase="start", time=held[1])
+                    attempt.mark("begin", phase="start", time=span[0])
+                    attempt.mark("end", phase="start", time=span[1])
                     return Turn()
             countdown = begin - guide.now if guide.now < begin else (1.0 - progress) * seconds
             note = guide.describe_problems() or moved

@@ -364,12 +364,12 @@ def _add_swivel_task(H, f, linear, J_elbow, hand, elbow, shoulder, swivel, weigh
         return
     axis = offset / far
     along = upper @ axis
-    own, wanted = upper - along * axis, swivel - (swivel @ axis) * axis
-    radius, size = np.sqrt(own @ own), np.sqrt(wanted @ wanted)
+    own, target = upper - along * axis, swivel - (swivel @ axis) * axis
+    radius, size = np.sqrt(own @ own), np.sqrt(target @ target)
     if radius < _MIN_SWIVEL or size < _MIN_SWIVEL:
         return
     tangent = np.cross(axis, own) / radius
-    angle = np.arctan2(wanted @ tangent, wanted @ own / radius)
+    angle = np.arctan2(target @ tangent, target @ own / radius)
     rate = min(max(0.5 * tasks[GAIN] * angle, -_MAX_SWIVEL_RATE), _MAX_SWIVEL_RATE)
     w = tasks[SWIVEL] * weight * min(1.0, size / _FULL_SWIVEL) * min(1.0, radius / _FULL_SWIVEL)
     row = tangent @ (_compute_point_jacobian(J_elbow, elbow) - along / far * linear)
