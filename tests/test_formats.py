@@ -149,6 +149,11 @@ def test_what_is_not_there_cannot_be_used(format: str, use: str, old: bytes, tmp
         read_device(path, format, use)
 
 
+def test_a_folder_of_a_maker_who_writes_no_orientations(tmp_path: Path) -> None:
+    with pytest.raises(BadData, match=r"a recording of phyphox holds no orientation; leave out data\.use"):
+        read_device(df.phyphox(tmp_path / "torso"), "phyphox", "orientation")
+
+
 def test_what_goes_before_what_in_a_file_with_both(tmp_path: Path) -> None:
     path = df.rosbag(tmp_path / "bag")
     recording = load_file(tmp_path, "bag", "[sensors.torso]\n[sensors.left_forearm]")

@@ -336,6 +336,8 @@ def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[Devic
     if format.files:
         with open_folder(path) as files:
             patterns = [format.files[kind] for kind in kinds if kind in format.files]
+            if not patterns:
+                raise BadData(f"{path}: a {format.title} holds no {use}; leave out data.use")
             selected = next(filter(None, (_select(files, pattern) for pattern in patterns)), None)
             if not selected:
                 raise BadData(f"{path}: no {' or '.join(dict.fromkeys(patterns))} in it with {format.needs}")
