@@ -15,7 +15,7 @@ import os
 import sys
 
 from ..errors import WeposeError
-from .stopping import catch_signals, ignore_signals, is_stopped, whats_written
+from .stopping import catch_signals, ignore_signals, is_stopped, describe_written
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -45,11 +45,11 @@ def main(argv: list[str] | None = None) -> None:
             ignore_signals()  # a second one would end in a traceback
         # A library may turn the interrupt into an error of its own.
         if is_stopped() or isinstance(error, KeyboardInterrupt):
-            code, line = 130, f"stopped; {whats_written()}"
+            code, line = 130, f"stopped; {describe_written()}"
         elif isinstance(error, WeposeError):
             code, line = 2, str(error)
         elif isinstance(error, OSError):
-            code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}; {whats_written()}"
+            code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}; {describe_written()}"
         else:
             raise
         print(f"wepose: {line}", file=sys.stderr)

@@ -35,7 +35,7 @@ def check_stopped() -> None:
         raise KeyboardInterrupt
 
 
-def whats_written() -> str:
+def describe_written() -> str:
     """What a command that ends early has written all the same, whole."""
     written = getattr(sys.modules.get("wepose_pin.documents"), "written", ())
     folders = [str(folder) for folder in written if folder.exists()]

@@ -116,11 +116,11 @@ def _list_episodes(
 def _check_alike(motions: Sequence[JointMotion]) -> int:
     """Return the whole rate [Hz] that all motions have."""
     first, *others = motions
-    whats = [f"robot {each.name}, {each.rate_hz:g} Hz, joints {', '.join(each.joints)}" for each in motions]
-    for other, what in zip(others, whats[1:], strict=True):
-        if what != whats[0]:
+    descriptions = [f"robot {each.name}, {each.rate_hz:g} Hz, joints {', '.join(each.joints)}" for each in motions]
+    for other, description in zip(others, descriptions[1:], strict=True):
+        if description != descriptions[0]:
             raise BadData(
-                f"{other.where}: {what}; a data set has one robot and one rate, and {first.where} is of {whats[0]}; "
+                f"{other.where}: {description}; a data set has one robot and one rate, and {first.where} is of {descriptions[0]}; "
                 f"--rate-hz makes one rate of all"
             )
     rate_hz = round(first.rate_hz)
