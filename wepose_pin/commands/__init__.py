@@ -15,7 +15,7 @@ import os
 import sys
 
 from ..errors import WeposeError
-from .stopping import catch_signals, ignore_signals, is_stopped, describe_written
+from .stopping import catch_signals, describe_written, ignore_signals, is_stopped
 
 
 def main(argv: list[str] | None = None) -> None:

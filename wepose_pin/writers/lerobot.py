@@ -120,8 +120,8 @@ def _check_alike(motions: Sequence[JointMotion]) -> int:
     for other, description in zip(others, descriptions[1:], strict=True):
         if description != descriptions[0]:
             raise BadData(
-                f"{other.where}: {description}; a data set has one robot and one rate, and {first.where} is of {descriptions[0]}; "
-                f"--rate-hz makes one rate of all"
+                f"{other.where}: {description}; a data set has one robot and one rate, "
+                f"and {first.where} is of {descriptions[0]}; --rate-hz makes one rate of all"
             )
     rate_hz = round(first.rate_hz)
     if not is_even(first.time) or abs(rate_hz - first.rate_hz) > 1e-3:
