@@ -33,6 +33,17 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .body.subject import population_subject as population_subject
     from .calibration import Calibration as Calibration
     from .calibration import calibrate as calibrate
+    from .diagnostics import Diagnostic as Diagnostic
+    from .errors import BadData as BadData
+    from .errors import BadModel as BadModel
+    from .errors import BadOption as BadOption
+    from .errors import BadPhase as BadPhase
+    from .errors import BadSession as BadSession
+    from .errors import BadSource as BadSource
+    from .errors import BadSubject as BadSubject
+    from .errors import ExistingOutput as ExistingOutput
+    from .errors import MissingFile as MissingFile
+    from .errors import NoSolution as NoSolution
     from .errors import WeposeError as WeposeError
     from .errors import WeposeWarning as WeposeWarning
     from .evaluation import evaluate as evaluate
@@ -51,8 +62,19 @@ if TYPE_CHECKING:  # what editors and type checkers see
 
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
+    "BadData": "errors",
+    "BadModel": "errors",
+    "BadOption": "errors",
+    "BadPhase": "errors",
+    "BadSession": "errors",
+    "BadSource": "errors",
+    "BadSubject": "errors",
     "Calibration": "calibration",
+    "Diagnostic": "diagnostics",
+    "ExistingOutput": "errors",
     "ImuSensor": "recording",
+    "MissingFile": "errors",
+    "NoSolution": "errors",
     "OrientationSensor": "recording",
     "Pose": "body.kinematics",
     "Recording": "recording",

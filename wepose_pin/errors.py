@@ -22,8 +22,8 @@ ALIKE = 0.6  # likeness of two names, from which on one may be meant by the othe
 class WeposeError(Exception):
     """Wrong input, in one line that names the place, the value and what would be right.
 
-    It is the base of all errors that this package raises on purpose. The others, such as `BadData` and `BadOption`, are
-    in `wepose_pin.errors`. `BadOption` is a `ValueError` too, and a name that a result does not have a `KeyError`.
+    It is the base of all errors that this package raises on purpose. `BadOption` is a `ValueError` too, and a name that
+    a result does not have is a `KeyError`.
     """
 
     def __str__(self) -> str:
