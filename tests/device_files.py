@@ -237,17 +237,6 @@ def emgworks(path: Path) -> Path:
     return path
 
 
-def emgworks_with_labels(path: Path) -> Path:
-    """Units in a line for each channel, before the names; as emgio describes it."""
-    names = [f"{kind}1.{a}" for kind in ("ACC", "GYRO") for a in AXES]
-    lines = [f"Label: {n}  Sampling frequency: 100 Unit: {'g' if 'ACC' in n else 'deg/s'}  Domain: Time" for n in names]
-    columns = [column for values in (ACCEL / G, np.degrees(GYRO)) for v in values.T for column in (TIME, v)]
-    path.write_text(
-        "\n".join(lines) + "\n\n" + table_text(columns, [x for name in names for x in ("X[s]", f'"{name}"')])
-    )
-    return path
-
-
 def sensor_logger(folder: Path, platform: str = "android", late: float = 0.0, gravity: bool = False) -> Path:
     folder.mkdir(parents=True)
     stamps = [str(1000 * US0 + 10_000_000 * k) for k in range(N)]

@@ -14,7 +14,7 @@ from ..body.body import load_sensed_model
 from ..body.subject import Subject, load_subject, parse_subject, population_subject, subject_toml
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadSession
-from ..readers.session_file import SensorKeys, find_model, read_joints, read_sensor_keys, read_session_file
+from ..readers.session_file import SensorKeys, read_head, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from .sources.base import Source
 from .sources.replay import ReplaySource
@@ -91,15 +91,9 @@ def read_setup(path: Path) -> SensorSetup:
     top = read_session_file(path)
     sensors = top.table("sensors")
     stated = {segment: read_sensor_keys(sensors.table(segment), SensorKeys()).mount for segment in sensors.values}
-    start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
-    return SensorSetup(
-        top.text("name", None) or Path(top.file).absolute().parent.name,
-        mounts={segment: mount for segment, mount in stated.items() if mount is not None},
-        start_pose=start_pose,
-        remounted=top.flag("remounted"),
-        joints=read_joints(top, start_pose),
-        model=find_model(Path(top.file), top),
-    )
+    head = read_head(top)
+    named = {key: getattr(head, key) for key in ("start_pose", "remounted", "joints", "model")}
+    return SensorSetup(head.name, mounts={name: mount for name, mount in stated.items() if mount is not None}, **named)
 
 
 def check_mounts(source: Source, setup: SensorSetup) -> None:

@@ -49,7 +49,6 @@ class Device(NamedTuple):
     kind: str  # a key of `NEEDED`
     sensors: Mapping[str, DeviceSensor]  # the file's name of each sensor or segment → what it measured
     since_power_on: bool = True  # the clock starts at power-on, or at another arbitrary moment
-    wraps_s: float | None = None  # [s] after which such a clock wraps; None: it does not
     aligned: bool = False  # the orientations are the segments' own, in one world
     diagnostics: tuple[Diagnostic, ...] = ()  # assumptions, and missing data
 

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import polars as pl
 
-from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable
-from ..errors import BadData, BadSession, MissingFile, one_of, printable
+from ..errors import BadData, BadSession, MissingFile, one_of
 from ..recording import (
     ImuSensor,
     OrientationSensor,
@@ -32,15 +31,13 @@ from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, Device, check_measured
 from .registry import detect_format, find_format, read_device
 from .session_file import (
+    OF_COLUMNS,
+    OF_FORMATS,
     WIDTHS,
     SensorKeys,
     check_columns,
-    check_effect,
-    find_model,
-    find_truth,
     read_data_keys,
-    read_joints,
-    read_phases,
+    read_head,
     read_sensor_keys,
     read_session_file,
 )
@@ -65,11 +62,9 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     WeposeError
         One line that names the file, the key or column, its value and what would be right.
     """
-    path = path / "session.toml" if path.is_dir() else path
     top = read_session_file(path, values)
-    data, stated = top.table("data"), top.table("sensors", {})
-    start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
-    files = _Files(path, data)
+    path = Path(top.file)
+    stated, files = top.table("sensors", {}), _Files(path, top.table("data"))
     # Whether the names are segments, and the start pose one of theirs, is checked where the body is known.
     tables = {name: stated.table(name) for name in stated.values}
     keys = {name: read_sensor_keys(table, files.keys) for name, table in tables.items()}
@@ -77,31 +72,21 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     check_columns(tables, keys)
     if not keys:
         raise BadSession(f"{path}: no sensors; one [sensors.<segment>] table each, without # before its lines")
-    head = Recording(
-        name=printable(top.text("name", None) or path.absolute().parent.name or path.stem),
-        time=np.empty(0),
-        rate_hz=0.0,
-        sensors={},
-        phases=read_phases(top.table("phases", {})),
-        start_pose=start_pose,
-        joints=read_joints(top, start_pose),
-        model=find_model(path, top),
-        remounted=top.flag("remounted"),
-        source=path,
-        truth=find_truth(path, data),
-    )
+    head = read_head(top)
     devices = {name: files.open_device(tables[name], each) for name, each in keys.items() if not each.signals}
-    check_effect(data, tables, keys)  # of what is no device's file, other keys are said to be missing
-    measured = {
-        name: files.take_sensor(name, tables[name], each, devices)
-        if name in devices
-        else files.read_sensor(tables[name], each)
-        for name, each in keys.items()
-    }
-    for name, each in measured.items():
-        if each.aligned and ("mount" in tables[name] or "orientation" not in each.values):
+    measured: dict[str, _Measured] = {}
+    for name, each in keys.items():
+        table = tables[name]
+        if unused := next((key for key in (OF_FORMATS if each.signals else OF_COLUMNS) if key in table), None):
+            why = "the columns are named here" if each.signals else "the format of the file defines it"
+            raise BadSession(f"{table.at(unused)} has no effect, as {why}; remove it")
+        if name in devices:
+            measured[name] = files.take_sensor(name, table, each, devices)
+        else:
+            measured[name] = files.read_sensor(table, each)
+        if measured[name].aligned and ("mount" in table or "orientation" not in measured[name].values):
             raise BadSession(
-                f"{tables[name].where}: aligned orientations are the segment's own: they need no mount, and no raw data"
+                f"{table.where}: aligned orientations are the segment's own: they need no mount, and no raw data"
             )
     files.tables.clear()  # of a day they are gigabytes
     time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
@@ -110,10 +95,10 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     check = check_sensors(str(path), {segment: each.list_samples() for segment, each in measured.items()}, start)
     sensors: dict[str, Sensor] = {}
     diagnostics = [*resampled, *files.diagnostics, *check.diagnostics]
-    for segment, each in measured.items():
-        sensor, marks = _bridge_gaps(each, segment, check, gaps)
-        sensors[segment] = resample(sensor, each.clock.time, time) if resampled else sensor
-        diagnostics += _report_bridged_gaps(segment, marks, each.clock.step)
+    for segment, own in measured.items():
+        sensor, marks = _bridge_gaps(own, segment, check, gaps)
+        sensors[segment] = resample(sensor, own.clock.time, time) if resampled else sensor
+        diagnostics += _report_bridged_gaps(segment, marks, own.clock.step)
     recording = replace(head, time=time, rate_hz=measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics))
     check_recording(recording)
     return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
@@ -160,17 +145,13 @@ class _Files:
         """Return the place of a key of a sensor, which may stand in [data]."""
         return (table if key in table else self.data).at(key)
 
-    # Of a known format
-
     def open_device(self, table: TomlTable, keys: SensorKeys) -> Device:
         """Read the file of a sensor without columns, whose format defines them."""
         path = self._find_file(keys)
-        if keys.format:
-            format: str | None = find_format(keys.format, self.path.parent, self._at(table, "format"))
-        elif path.exists():
-            format = detect_format(path)
-        else:
+        if not keys.format and not path.exists():
             raise MissingFile(f"{path}: no such file or folder")
+        place = self._at(table, "format")
+        format = find_format(keys.format, self.path.parent, place) if keys.format else detect_format(path)
         if format is None:
             table.names("gyro", WIDTHS["gyro"])  # an error: the session must name the columns of a table
         key = (path, format, keys.use, keys.rate_hz)
@@ -192,34 +173,31 @@ class _Files:
             raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
         (label,) = labels
         sensor = device.sensors[label]
-        time = sensor.time
+        offset_s = keys.offset_s
         if device.since_power_on:
-            running = [each for each in devices.values() if each.since_power_on]
-            begins = [_unwrap_begin(each, running[0].begin) for each in running]
-            time = time - device.begin + _unwrap_begin(device, running[0].begin) - min(begins)
-        clock = self._build_clock((path, id(sensor.time), keys.offset_s), path, time + keys.offset_s, str(path))
+            offset_s -= min(each.begin for each in devices.values() if each.since_power_on)
+        clock = self._build_clock((path, id(sensor.time), offset_s), path, sensor.time + offset_s, str(path))
         columns = {signal: [f"{label} {signal}"] for signal in sensor.signals}
         mount = sensor.mount if keys.mount is None else keys.mount
         aligned = device.aligned if keys.aligned is None else keys.aligned
         return _Measured(f"{path}: {table.place}", columns, clock, sensor.signals, mount, aligned)
 
-    # Of columns that the session names
-
     def read_sensor(self, table: TomlTable, keys: SensorKeys) -> _Measured:
-        """Read the columns or arrays of a sensor."""
-        path, is_array = self._find_file(keys), is_array_file(self._find_file(keys))
+        """Read the columns or arrays of a sensor, which the session names."""
+        path = self._find_file(keys)
         if bool(keys.time) == (keys.rate_hz is not None):
             stated = "both is" if keys.time else "neither is"
             raise BadSession(
                 f"{self._at(table, 'time')} or rate_hz is needed, one of the two, and {stated} there: a column of "
                 f"times, or a rate"
             )
-        units = {"gyro": GYRO_UNITS.get(keys.gyro_unit), "accel": ACCEL_UNITS.get(keys.accel_unit), "orientation": 1.0}
-        for signal, known in (("gyro", GYRO_UNITS), ("accel", ACCEL_UNITS)):
-            if signal in keys.signals and units[signal] is None:
+        units = {"orientation": 1.0}
+        for signal, unit, known in (("gyro", keys.gyro_unit, GYRO_UNITS), ("accel", keys.accel_unit, ACCEL_UNITS)):
+            if signal in keys.signals and not unit:
                 raise BadSession(f"{self._at(table, f'{signal}_unit')} is missing; {one_of(known)}")
+            units[signal] = known.get(unit, 1.0)
         columns = dict(keys.signals)
-        if is_array:
+        if is_array_file(path):
             file = _open(self._arrays, ArrayFile, path)
             for signal, names in columns.items():
                 if len(names) == 1:
@@ -227,16 +205,15 @@ class _Files:
             places = {name: table.at(signal) for signal, names in columns.items() for name in names}
             content = file.table(places | ({keys.time: self._at(table, "time")} if keys.time else {}))
         else:
-            for signal, names in columns.items():
-                if len(names) == 1:
-                    table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
+            for signal in (signal for signal, names in columns.items() if len(names) == 1):
+                table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
             content = _open(self.tables, read_table, path)
         if keys.rate_hz is not None:
             time, source = np.arange(content.height) / keys.rate_hz, self._at(table, "rate_hz")
         else:
             time, source = read_columns(content, [keys.time], str(path), self._at(table, "time"))[:, 0], str(path)
             time = TIME_UNITS[keys.time_unit] * time
-        key = (path, table.where if is_array else "", keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
+        key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
         clock = self._build_clock(key, path, time + keys.offset_s, source)
         values = {
             signal: units[signal] * read_columns(content, names, str(path), table.at(signal))
@@ -261,13 +238,6 @@ def _open(opened: dict[Path, T], read: Callable[[Path], T], path: Path) -> T:
     if path not in opened:
         opened[path] = read(path)
     return opened[path]
-
-
-def _unwrap_begin(device: Device, reference: float) -> float:
-    """Return when a device began [s]; its counter may have wrapped before the recording, the reference's not."""
-    if not device.wraps_s:
-        return device.begin
-    return device.begin + device.wraps_s * round((reference - device.begin) / device.wraps_s)
 
 
 # Gaps --------------------------------------------------------------------------------------------------------------

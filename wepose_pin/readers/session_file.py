@@ -9,9 +9,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from ..body.table import NEUTRAL_POSE
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
-from ..errors import BadPhase, BadSession, MissingFile
-from ..recording import CONFIGURATION, Intervals, compute_mount
+from ..errors import BadPhase, BadSession, MissingFile, printable
+from ..recording import CONFIGURATION, Intervals, Recording, compute_mount
 from ..recording.clocks import TIME_UNITS
 from ..recording.sensors import read_axes
 from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED
@@ -26,9 +27,9 @@ SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "s
 _RENAMED_PHASES = {
     "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
 }
-# Keys that have an effect only where a format reads the file, or only where the session names columns.
-_OF_FORMATS: tuple[str, ...] = ("format", "label", "use")
-_OF_COLUMNS: tuple[str, ...] = ("gyro_unit", "accel_unit", "time", "time_unit")
+# Keys of a sensor that have an effect only where a format reads the file, or only where the session names columns.
+OF_FORMATS = ("format", "label", "use")
+OF_COLUMNS = ("gyro_unit", "accel_unit", "time", "time_unit")
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
 _CHOICES: dict[str, Collection[str]] = {
     "use": NEEDED,
@@ -77,6 +78,64 @@ def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> To
     return top
 
 
+def read_head(top: TomlTable) -> Recording:
+    """Read what a session file states besides its data: a recording without sensors and samples.
+
+    Raises
+    ------
+    MissingFile, BadSession, BadPhase
+        A key has a wrong value, or names a file that is missing; a phase is empty.
+    """
+    path, name = Path(top.file), top.text("name", None)
+    start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
+    joints, truth = top.table("joints", {}), top.table("data", {}).text("truth", None)
+    if joints.values and start_pose != CONFIGURATION:
+        raise BadSession(f'{top.at("joints")} needs start_pose = "{CONFIGURATION}", and it is "{start_pose}"')
+    if truth is not None and not (path.parent / truth).is_file():
+        place = top.table("data").at("truth")
+        raise MissingFile(f"{place}: no such file '{truth}' beside {path.name}; name it rightly or leave it out")
+    return Recording(
+        name=printable(name or path.absolute().parent.name or path.stem),
+        time=np.empty(0),
+        rate_hz=0.0,
+        sensors={},
+        phases=_read_phases(top.table("phases", {})),
+        start_pose=start_pose,
+        joints={joint: joints.number(joint, None) or 0.0 for joint in joints.values},
+        model=_find_model(path, top),
+        remounted=top.flag("remounted"),
+        source=path,
+        truth=None if truth is None else path.parent / truth,
+    )
+
+
+def _find_model(path: Path, top: TomlTable) -> str:
+    """Find the body that the session names: a file beside it, or the name of a body of the package; empty: none."""
+    name = top.text("model", None) or ""
+    file = path.parent / name
+    if name and not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
+        raise MissingFile(
+            f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name "
+            f"of a body of the package is needed"
+        )
+    return str(file) if file.is_file() else name
+
+
+def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
+    """Read the intervals [s] of each phase."""
+    keys.allow(*keys.values, renamed=_RENAMED_PHASES)
+    phases: dict[str, Intervals] = {}
+    for name, value in keys.values.items():
+        pairs: list[Any] = value if isinstance(value, list) else [None]
+        if not all(isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) for pair in pairs):
+            raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
+        phases[name] = tuple((float(a), float(b)) for a, b in pairs)
+        for first, last in phases[name]:
+            if not first < last:
+                raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
+    return phases
+
+
 def read_data_keys(table: TomlTable) -> SensorKeys:
     """Read the keys in [data]."""
     return read_record(SensorKeys, table, _CHOICES, others=("truth",))
@@ -105,73 +164,11 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
 
 def check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
     """Raise `BadSession` where two sensors name one column."""
-    owners: dict[tuple[Path, str], str] = {}
+    owners: dict[tuple[str, str], str] = {}
     for name, each in keys.items():
-        for signal, columns in each.signals.items():
-            for column in columns:
-                owner = owners.setdefault((Path(each.file), column), name)
-                if owner != name:
-                    raise BadSession(
-                        f"{tables[name].at(signal)}: '{column}' of {each.file} is a column of sensors.{owner} too; "
-                        f"each sensor needs its own"
-                    )
-
-
-def check_effect(data: TomlTable, tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
-    """Raise `BadSession` where a key has no effect on its sensor, or one in [data] on none of the sensors."""
-    for table, sensors in [*((tables[name], [each]) for name, each in keys.items()), (data, list(keys.values()))]:
-        named = {bool(each.signals) for each in sensors}
-        unused, why = _OF_FORMATS, "the columns are named here"
-        if named == {False}:
-            unused, why = _OF_COLUMNS, "the format of the file defines it"
-        key = next((key for key in unused if key in table), None)
-        if key and len(named) == 1:
-            raise BadSession(f"{table.at(key)} has no effect, as {why}; remove it")
-
-
-def read_phases(keys: TomlTable) -> dict[str, Intervals]:
-    """Read the intervals [s] of each phase."""
-    keys.allow(*keys.values, renamed=_RENAMED_PHASES)
-    phases: dict[str, Intervals] = {}
-    for name, value in keys.values.items():
-        pairs: list[Any] = value if isinstance(value, list) else [None]
-        if not all(isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) for pair in pairs):
-            raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
-        phases[name] = tuple((float(a), float(b)) for a, b in pairs)
-        for first, last in phases[name]:
-            if not first < last:
-                raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
-    return phases
-
-
-def read_joints(top: TomlTable, start_pose: str) -> dict[str, float]:
-    """Read the values of joints [rad or m] in the start pose."""
-    joints = top.table("joints", {})
-    if joints.values and start_pose != CONFIGURATION:
-        raise BadSession(f'{top.at("joints")} needs start_pose = "{CONFIGURATION}", and it is "{start_pose}"')
-    return {name: joints.number(name, None) or 0.0 for name in joints.values}
-
-
-def find_model(path: Path, top: TomlTable) -> str:
-    """Find the body that the session file `path` names: a file beside it, or the name of a body of the package.
-
-    Empty where it names none.
-    """
-    name = top.text("model", None) or ""
-    file = path.parent / name
-    if name and not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
-        raise MissingFile(
-            f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name "
-            f"of a body of the package is needed"
-        )
-    return str(file) if file.is_file() else name
-
-
-def find_truth(path: Path, data: TomlTable) -> Path | None:
-    """Find the file with the truth beside the session file `path`; None: the session has none."""
-    name = data.text("truth", None)
-    if name is not None and not (path.parent / name).is_file():
-        raise MissingFile(
-            f"{data.at('truth')}: no such file '{name}' beside {path.name}; name it rightly or leave it out"
-        )
-    return None if name is None else path.parent / name
+        for signal, column in ((signal, column) for signal, own in each.signals.items() for column in own):
+            if (owner := owners.setdefault((each.file, column), name)) != name:
+                raise BadSession(
+                    f"{tables[name].at(signal)}: '{column}' of {each.file} is a column of sensors.{owner} too; "
+                    f"each sensor needs its own"
+                )

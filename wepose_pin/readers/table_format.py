@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -38,7 +38,7 @@ from .device import (
 
 FOLDER = Path(__file__).parent / "formats"
 SEPARATORS = "\t,; "
-MOST_LINES = 2000  # before the names; some exports have a line for each channel
+MOST_LINES = 200  # up to the names
 MOST_AFTER = 4  # lines of text between the names and the numbers
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "wxyz"}
 _COUNTS = {"gyro": (1, 3), "accel": (1, 3), "orientation": (1, 3, 4, 9)}  # of columns; 1 is a pattern
@@ -63,7 +63,7 @@ class Columns(NamedTuple):
         if len(self.columns) > 1:
             return ("", self.columns.index(name), "") if name in self.columns else None
         match = _match(self.columns[0], name)
-        groups = {} if match is None else {key: (text or "").strip() for key, text in match.groupdict().items()}
+        groups = {key: (text or "").strip() for key, text in match.groupdict().items()} if match else {}
         axis = groups.get("axis", "")[:1].lower().replace("s", "w")  # APDM calls the w of a quaternion its scalar
         if not axis or axis not in axes:
             return None
@@ -94,7 +94,6 @@ class TableFormat(NamedTuple):
     sensor_begins: str = ""
     axes_line: _Line = 0.0
     units_line: _Line = 0.0
-    units_before: str = ""
     label_line: str = ""
     label_in_name: str = ""
     sync_line: str = ""
@@ -131,12 +130,11 @@ class TableFormat(NamedTuple):
         joins = self.times_before or len(tables) > 1  # a rate is that of the joined signals
         alone = tables[0].about.get(self.label_line) or _name_alone(self, path)
         devices: dict[str, dict[str, Signal]] = {}
-        wraps_s = None
         for sensor, signals in sensors.items():
             own = devices.setdefault(sensor or alone, {})
             for name in NEEDED[kind] if set(NEEDED[kind]) <= set(signals) else ():
                 first, *others = signals[name]
-                time, wraps_s = _read_time(self, first, sensor, None if joins else rate_hz)
+                time = _read_time(self, first, sensor, None if joins else rate_hz)
                 values = _read_values(name, first, time)
                 if others and (np.abs(values) > first.format.limit).any():
                     values = _read_values(name, others[0], time)
@@ -146,8 +144,7 @@ class TableFormat(NamedTuple):
         if self.sync_line and not tables[0].about.get(self.sync_line, "synced").lower().startswith("synced"):
             diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
         needs = f"{self.needs}; it has: {', '.join(filter(None, tables[0].names[:12]))}"
-        device = make_device(path, devices, needs, use, rate_hz if joins else None, diagnostics)
-        return device._replace(wraps_s=None if joins else wraps_s)
+        return make_device(path, devices, needs, use, rate_hz if joins else None, diagnostics)
 
     def is_time(self, name: str) -> bool:
         """Return whether a column of this name gives the time."""
@@ -172,41 +169,33 @@ def load_format(path: Path) -> TableFormat:
     """
     table = TomlTable(read_toml(path, "a description of tables"), str(path))
     format = read_record(TableFormat, table, others=("files", "clock", *AXES))
-    signals = {signal: tuple(_read_columns(signal, each) for each in table.entries(signal)) for signal in AXES}
+    entries = {signal: [(each, read_record(Columns, each)) for each in table.entries(signal)] for signal in AXES}
     clocks = tuple(read_record(ClockColumn, each) for each in table.entries("clock"))
-    if not clocks or not (signals["orientation"] or (signals["gyro"] and signals["accel"])):
+    if not clocks or not (entries["orientation"] or (entries["gyro"] and entries["accel"])):
         raise BadSession(f"{path}: needs [[clock]], and [[gyro]] and [[accel]], or [[orientation]]")
     keys = table.table("files", {})
     keys.allow(*NEEDED)
-    patterns = [*format.detect, format.sensor_begins, format.units_before, format.label_in_name]
+    patterns = [*format.detect, format.sensor_begins, format.label_in_name]
     patterns += [text for clock in clocks for text in (clock.column, clock.rate)]
-    patterns += [each.columns[0] for own in signals.values() for each in own if len(each.columns) == 1]
+    for signal, each in entries.items():
+        for entry, columns in each:
+            counts = (4,) if signal == "gyro" and columns.increments else _COUNTS[signal]
+            if len(columns.columns) not in counts:
+                needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
+                raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {needed} are needed")
+            patterns += columns.columns if len(columns.columns) == 1 else ()
     for text in patterns:
         try:
             re.compile(text)
         except (re.error, RecursionError, OverflowError) as error:
             raise BadSession(f"{path}: '{text}' is no regular expression: {error}") from None
-    needed = [(format.units_before, "name"), (format.units_before, "unit"), (format.label_in_name, "label")]
-    needed += [(each.columns[0], "axis") for own in signals.values() for each in own if len(each.columns) == 1]
-    for text, group in needed:
-        if text and group not in re.compile(text).groupindex:
-            raise BadSession(f"{path}: '{text}' has no group '{group}'; write (?P<{group}>...) around it")
     return format._replace(
         title=format.title or path.stem,
-        needs=format.needs or " and ".join(signal for signal in AXES if signals[signal]),
+        needs=format.needs or " and ".join(signal for signal in AXES if entries[signal]),
         files={kind: keys.text(kind, None) or "" for kind in keys.values},
         clocks=clocks,
-        signals=signals,
+        signals={signal: tuple(columns for _, columns in each) for signal, each in entries.items()},
     )
-
-
-def _read_columns(signal: str, entry: TomlTable) -> Columns:
-    columns = read_record(Columns, entry)
-    counts = (4,) if signal == "gyro" and columns.increments else _COUNTS[signal]
-    if len(columns.columns) not in counts:
-        needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
-        raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {needed} are needed")
-    return columns
 
 
 @cache
@@ -233,7 +222,7 @@ class DeviceTable:
     cells: pl.DataFrame  # columns "0", "1", … that the description names, without rows that have no values in them
     times: dict[int | None, np.ndarray] = field(default_factory=dict)  # [s] read from a column; None: of a rate
 
-    def has_values(self, columns: Iterable[int]) -> bool:
+    def has_values(self, columns: Sequence[int]) -> bool:
         """Return whether each of some columns has a value in any cell."""
         return all(self.cells[str(column)].is_not_null().any() for column in columns)
 
@@ -247,40 +236,23 @@ class DeviceTable:
 
 
 def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
-    """Parse a table; None: it has no line of names, with a column of time and one of a signal.
-
-    Raises
-    ------
-    MissingFile, BadData
-        The file is not readable; no rows; zero bytes in it.
-    """
+    """Parse a table; None: it has no line of names, with a column of time and one of a signal."""
     lines = read_first_lines(path, MOST_LINES)
-    for k, line in enumerate(lines):
-        for separator in () if line.startswith(("//", "#")) else SEPARATORS:
-            if line.count(separator) < 3:
-                continue
-            names, units = _name_columns(format, lines, k, separator)
-            if any(map(format.is_time, names)) and any(map(format.is_signal, names)):
-                break
-        else:
-            continue
-        break
+    tables = [(k, line) for k, line in enumerate(lines) if not line.startswith(("//", "#"))]
+    for k, separator in ((k, sign) for k, line in tables for sign in SEPARATORS if line.count(sign) >= 3):
+        names, units = _name_columns(format, lines, k, separator)
+        if any(map(format.is_time, names)) and any(map(format.is_signal, names)):
+            break
     else:
         return None
-    about = {}
-    for text in lines[:k]:
-        name, colon, value = text.strip("/ ").partition(":")
-        if colon:
-            about[name.strip()] = value.strip(f" {SEPARATORS}")
+    lines_before = (text.strip("/ ").partition(":") for text in lines[:k])
+    about = {name.strip(): value.strip(f" {SEPARATORS}") for name, colon, value in lines_before if colon}
     first = k + 1 + int(max(format.axes_line, format.units_line, 0.0))
     for cells in (_split(row, separator) for row in lines[first : first + MOST_AFTER]):
         if any(map(_NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
             break
         first += 1
     body = read_body(path, first)
-    if b"\0" in body or not body.strip():
-        content = "zero bytes" if body.strip() else f"no line of numbers after the names in line {k + 1}"
-        raise BadData(f"{path}: there is {content} in it; the export is damaged, empty or cut off")
     width = max(len(names), body.partition(b"\n")[0].count(separator.encode()) + 1)
     table = parse_rows(path, body, [str(column) for column in range(width)], separator, lenient=True)
     last = max(column for column, name in enumerate(names) if name)
@@ -288,6 +260,8 @@ def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
         table = table.head(-1)  # the last line is incomplete
     columns = [str(column) for column, name in enumerate(names) if format.is_time(name) or format.is_signal(name)]
     table = table.select(columns).filter(pl.any_horizontal(pl.all().is_not_null()))
+    if table.is_empty() or b"\0" in body:
+        raise BadData(f"{path}: no sound lines of numbers after the names in line {k + 1}; the export is damaged")
     return DeviceTable(path, names, units, about, table)
 
 
@@ -297,15 +271,12 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: str) -> tuple[list[str], list[str]]:
     """Name the columns of line k, as ``sensor/name/axis`` where these stand in lines of their own; and their units."""
-
-    def read(offset: float) -> list[str]:
-        line = k + int(offset)
-        return _split(lines[line], separator) if offset and 0 <= line < len(lines) else []
-
     own = _split(lines[k], separator)
-    rows = [own, read(format.sensors_line), read(format.axes_line), read(format.units_line)]
-    width = max(len(rows[0]), len(rows[2]))
-    own, owners, axes, units = ([*row, *[""] * width][:width] for row in rows)
+    offsets = (format.sensors_line, format.axes_line, format.units_line)
+    places = [k + int(offset) if offset else -1 for offset in offsets]
+    owners, axes, units = (_split(lines[n], separator) if 0 <= n < len(lines) else [] for n in places)
+    width = max(len(own), len(axes))
+    own, owners, axes, units = ([*row, *[""] * width][:width] for row in (own, owners, axes, units))
     if format.sensor_begins:
         begins = [column for column, name in enumerate(own) if name and _match(format.sensor_begins, name)]
     else:
@@ -319,10 +290,6 @@ def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: 
     for column in range(width):
         name = own[column] or (name if format.axes_line and axes[column] else "")
         names.append("/".join(filter(None, (sensors[column], name, axes[column]))))
-    if format.units_before:
-        stated = [match.groupdict() for line in lines[:k] if (match := _match(format.units_before, line))]
-        by_name = {groups.get("name"): groups.get("unit") or "" for groups in stated}
-        units = [by_name.get(name, "") for name in own]
     return names, units
 
 
@@ -379,10 +346,10 @@ def _find_sensors(format: TableFormat, tables: Sequence[DeviceTable]) -> _Sensor
                 axes = own.setdefault(sensor, {})
                 if axis in axes:
                     raise BadData(f"{table.path}: '{name}' and '{table.names[axes[axis][0]]}' are one axis")
-                axes[axis] = k, unit or (table.units[k] if k < len(table.units) else "")
+                axes[axis] = k, unit or table.units[k]
+        count = len(columns.columns) if len(columns.columns) > 1 else len(AXES[signal])
         for sensor, axes in own.items():
             places = [axes[axis][0] for axis in sorted(axes)]
-            count = len(columns.columns) if len(columns.columns) > 1 else len(AXES[signal])
             signals = sensors.setdefault(sensor, {})
             if len(places) == count and table.has_values(places):
                 unit = next(filter(None, (unit for _, unit in axes.values())), columns.unit)
@@ -435,10 +402,8 @@ def _read_quat(path: Path, values: np.ndarray) -> np.ndarray:
     return quat
 
 
-def _read_time(
-    format: TableFormat, source: _Source, sensor: str, rate_hz: float | None
-) -> tuple[np.ndarray, float | None]:
-    """Read times (n,) [s] on the device's clock, and the time [s] after which it wraps."""
+def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float | None) -> np.ndarray:
+    """Read times (n,) [s] on the device's clock, one array for all signals that share them."""
     table = source.table
     for clock in format.clocks:
         column = _find_time(format, clock, source, sensor)
@@ -450,17 +415,15 @@ def _read_time(
             rate = rate_hz or (float(number[0]) if number else 0.0)
             counter = table.numbers([column])[:, 0]
             if rate > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
-                packets = unwrap_counter(counter, clock.wraps)
-                a_second = max(1.0, float(np.median(np.diff(packets)))) * rate
-                time = table.times.setdefault(column, packets / a_second)
-                return time, clock.wraps / a_second if clock.wraps else None
+                packets = _unwrap(counter, clock.wraps)
+                return table.times.setdefault(column, packets / (max(1.0, float(np.median(np.diff(packets)))) * rate))
         elif not rate_hz:
             if column not in table.times:
                 time = _read_stamps(clock, table, column)
                 table.times[column] = spread_equal_times(time) if clock.spread else time
-            return table.times[column], clock.unit_s * clock.wraps if clock.wraps else None
+            return table.times[column]
     if rate_hz:
-        return table.times.setdefault(None, np.arange(table.cells.height) / rate_hz), None
+        return table.times.setdefault(None, np.arange(table.cells.height) / rate_hz)
     names = " or ".join(f"'{clock.column}'" for clock in format.clocks)
     raise MissingRate(
         f"{table.path}: no times are known from {names}, or a rate in a line before the table; state the update "
@@ -475,26 +438,25 @@ def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor:
         if first == 0 or not _match(clock.column, table.names[first - 1]):
             raise BadData(f"{table.path}: no column of times right before '{table.names[first]}'; export them too")
         return first - 1
-    matches = [(k, match) for k, name in enumerate(table.names) if (match := _match(clock.column, name))]
-    own = [k for k, match in matches if match.groupdict().get("sensor") == sensor]  # else the times may be shared
-    return next(iter([*own, *(k for k, _ in matches)]), None)
+    matches = {k: match for k, name in enumerate(table.names) if (match := _match(clock.column, name))}
+    own = (k for k, match in matches.items() if match.groupdict().get("sensor") == sensor)
+    return next(own, next(iter(matches), None))  # else the times may be shared
 
 
 def _read_stamps(clock: ClockColumn, table: DeviceTable, column: int) -> np.ndarray:
     """Read a column of times [s], of numbers or dates."""
-    if clock.date and table.cells[str(column)].dtype == pl.String:
-        dates = table.cells[str(column)].str.to_datetime(clock.date, time_unit="us", strict=False)
+    cells = table.cells[str(column)]
+    if clock.date and cells.dtype == pl.String:
+        dates = cells.str.to_datetime(clock.date, time_unit="us", strict=False)
         if dates.null_count() < len(dates):
             return 1e-6 * dates.to_physical().cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return clock.unit_s * unwrap_counter(table.numbers([column])[:, 0], clock.wraps)
+    return clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
 
 
-def unwrap_counter(counter: np.ndarray, wraps: float | None) -> np.ndarray:
+def _unwrap(counter: np.ndarray, wraps: float | None) -> np.ndarray:
     """Unwrap a counter (n,) that starts again at `wraps`; NaN stay."""
     if wraps is None:
         return counter
-    good = np.isfinite(counter)
-    count = np.cumsum(np.diff(counter[good], prepend=counter[good][:1]) < -wraps / 2)
-    result = np.full(len(counter), np.nan)
-    result[good] = counter[good] + wraps * count
-    return result
+    good, unwrapped = np.isfinite(counter), counter.copy()
+    unwrapped[good] += wraps * np.cumsum(np.diff(counter[good], prepend=counter[good][:1]) < -wraps / 2)
+    return unwrapped
