@@ -27,13 +27,13 @@ def test_a_joints_misfit_and_its_jacobian() -> None:
     rng = np.random.default_rng(0)
     near_B, far_B = rng.normal(size=(2, 50, 3, 8))
     at = rng.normal(size=15)
-    residual = linearize_joint(near_B, far_B, at[0], at[1:8], at[8:])
-    J = differentiate(lambda x: linearize_joint(near_B, far_B, x[0], x[1:8], x[8:]).e, at)
-    np.testing.assert_allclose(residual.jacobian, J, rtol=1e-6, atol=1e-6)
+    e, jacobian, force = linearize_joint(near_B, far_B, at[0], at[1:8], at[8:])
+    J = differentiate(lambda x: linearize_joint(near_B, far_B, x[0], x[1:8], x[8:])[0], at)
+    np.testing.assert_allclose(jacobian, J, rtol=1e-6, atol=1e-6)
     R = Rotation.from_rotvec([0.0, 0.0, at[0]]).as_matrix()
     near = (near_B @ np.concatenate(([1.0], at[1:8]))) @ R.T
-    np.testing.assert_allclose(residual.force, near, rtol=1e-12)
-    np.testing.assert_allclose(residual.e, far_B @ np.concatenate(([1.0], at[8:])) - near, rtol=1e-12)
+    np.testing.assert_allclose(force, near, rtol=1e-12)
+    np.testing.assert_allclose(e, far_B @ np.concatenate(([1.0], at[8:])) - near, rtol=1e-12)
 
 
 def test_pairs_are_neighbours_with_nothing_between_that_moves() -> None:
@@ -77,11 +77,11 @@ def test_a_gap_is_pinocchios() -> None:
     pose = compute_pose(model, np.zeros(1), dict(zip(names, turned.as_quat()[:, None], strict=True)))
     points = PointPair(model, StartPose(model.neutral_rotations), names, ("left_palm", "right_palm"))
     assert set(points.segments) == set(names)
-    rows = points.linearize(quat_WL[None], headings)
-    np.testing.assert_allclose(rows.gap, pose.points["left_palm"] - pose.points["right_palm"], atol=1e-9)
-    J = differentiate(lambda x: points.linearize(quat_WL[None], x).gap, headings)
-    np.testing.assert_allclose(rows.H, J, atol=1e-6)
+    gap, H, by_shape, *_ = points.linearize(quat_WL[None], headings)
+    np.testing.assert_allclose(gap, pose.points["left_palm"] - pose.points["right_palm"], atol=1e-9)
+    J = differentiate(lambda x: points.linearize(quat_WL[None], x)[0], headings)
+    np.testing.assert_allclose(H, J, atol=1e-6)
     longer = model.with_lengths({"left_forearm": model.lengths["left_forearm"] + 0.01})
     other = PointPair(longer, StartPose(model.neutral_rotations), names, points.points)
-    grown = 0.01 * rows.by_shape[:, :, list(model.lengths).index("left_forearm")]
-    np.testing.assert_allclose(other.linearize(quat_WL[None], headings).gap - rows.gap, grown, atol=1e-9)
+    grown = 0.01 * by_shape[:, :, list(model.lengths).index("left_forearm")]
+    np.testing.assert_allclose(other.linearize(quat_WL[None], headings)[0] - gap, grown, atol=1e-9)

@@ -129,10 +129,10 @@ def estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
 
 def _fit_levers(near: np.ndarray, far: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
     """Misfit (3 n,) of the joint with the best levers, and its derivative by the heading."""
-    without = linearize_joint(near, far, heading, np.zeros(3), np.zeros(3))
-    H = without.jacobian[:, :, 1:].reshape(-1, 6)
+    e, jacobian, _ = linearize_joint(near, far, heading, np.zeros(3), np.zeros(3))
+    H = jacobian[:, :, 1:].reshape(-1, 6)
     normal = H.T @ H + LEAST_LEVER * len(H) * np.eye(6)
-    levers = -np.linalg.solve(normal, H.T @ without.e.ravel())
-    fitted = linearize_joint(near, far, heading, levers[:3], levers[3:])
-    slope = fitted.jacobian[:, :, 0].ravel()
-    return fitted.e.ravel(), slope - H @ np.linalg.solve(normal, H.T @ slope)
+    levers = -np.linalg.solve(normal, H.T @ e.ravel())
+    e, jacobian, _ = linearize_joint(near, far, heading, levers[:3], levers[3:])
+    slope = jacobian[:, :, 0].ravel()
+    return e.ravel(), slope - H @ np.linalg.solve(normal, H.T @ slope)

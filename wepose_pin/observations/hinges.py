@@ -56,24 +56,25 @@ class HingePlane(NamedTuple):
         return ca.dot(axis, along) / ca.norm_2(axis)
 
 
-class HingeRows(NamedTuple):
-    """What n samples of two orientations show of a hinge."""
+def linearize_hinge(
+    hinge: HingePlane, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Linearize a hinge of orientations (n, 4) at heading errors (2,) [rad] of `moves` and `on`.
 
-    r: np.ndarray  # (n,) [rad] out of the hinge's plane
-    H: np.ndarray  # (n, 4) its slope by the headings of `moves` and `on`, and by the axis along `across` and `tilted`
-    excess: np.ndarray  # (n,) [rad] beyond the hinge's range, signed
-    slope: np.ndarray  # (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
-
-
-def linearize_hinge(hinge: HingePlane, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray) -> HingeRows:
-    """Linearize a hinge of orientations (n, 4) at heading errors (2,) [rad] of `moves` and `on`."""
+    Returns
+    -------
+    r : (n,) [rad] out of the hinge's plane
+    H : (n, 4) its slope by the headings of `moves` and `on`, and by the axis along `across` and `tilted`
+    excess : (n,) [rad] beyond the hinge's range, signed
+    slope : (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
+    """
     r, H, excess, slope = evaluate(_linearization(hinge), quat_on, quat_moves, headings)
-    return HingeRows(r[:, 0, 0], H[:, 0], excess[:, 0, 0], slope[:, 0, 0])
+    return r[:, 0, 0], H[:, 0], excess[:, 0, 0], slope[:, 0, 0]
 
 
 @lru_cache(maxsize=128)
 def _linearization(hinge: HingePlane) -> ca.Function:
-    """Return `HingeRows` of a sample as a function of both quaternions and both headings."""
+    """Return the rows of a sample as a function of both quaternions and both headings."""
     on, moves = ca.SX.sym("on", 4), ca.SX.sym("moves", 4)
     headings, error = ca.SX.sym("headings", 2), ca.SX.sym("error", 2)
     quat_on, quat_moves = product(about_z(headings[1]), on), product(about_z(headings[0]), moves)

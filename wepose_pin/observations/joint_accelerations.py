@@ -41,24 +41,22 @@ class JointPair(NamedTuple):
     travels: bool  # whether the joint travels on the near segment, as a shoulder does
 
 
-class JointResidual(NamedTuple):
-    """The misfit of m samples of a joint's specific force between its two sensors."""
-
-    e: np.ndarray  # (m, 3) [m/s²] the far side less the near one, in the far one's W
-    jacobian: np.ndarray  # (m, 3, 1 + 2 p) by the angle and by the p parts of a of the near and of the far sensor
-    force: np.ndarray  # (m, 3) [m/s²] of the joint by the near sensor, in the far one's W
-
-
 def linearize_joint(
     near_B: np.ndarray, far_B: np.ndarray, angle: float, near: np.ndarray, far: np.ndarray
-) -> JointResidual:
-    """Compute the misfit of a joint and its Jacobian.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the misfit of m samples of a joint's specific force between its two sensors, and its Jacobian.
 
     Parameters
     ----------
     near_B, far_B : (m, 3, 1 + p) sides of the two sensors, the first p + 1 columns of `compute_sides`, filtered alike
     angle : [rad] turns the near side about the vertical into the far one
     near, far : (p,) lever r [m], force ε [m/s²] and delay τ [s] of each sensor, or the lever alone
+
+    Returns
+    -------
+    e : (m, 3) [m/s²] the far side less the near one, in the far one's W
+    jacobian : (m, 3, 1 + 2 p) of e by the angle and by the parts of `near` and `far`
+    force : (m, 3) [m/s²] of the joint by the near sensor, in the far one's W
     """
     c, s = np.cos(angle), np.sin(angle)
     turned_B = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ near_B
@@ -66,7 +64,7 @@ def linearize_joint(
     jacobian = np.empty((len(force), 3, 1 + len(near) + len(far)))
     jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 2, 0] = force[:, 1], -force[:, 0], 0.0
     jacobian[:, :, 1 : 1 + len(near)], jacobian[:, :, 1 + len(near) :] = -turned_B[:, :, 1:], far_B[:, :, 1:]
-    return JointResidual(far_B[:, :, 0] + far_B[:, :, 1:] @ far - force, jacobian, force)
+    return far_B[:, :, 0] + far_B[:, :, 1:] @ far - force, jacobian, force
 
 
 def compute_sides(R_WS: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> np.ndarray:

@@ -155,16 +155,6 @@ def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -
     return tuple(terms)
 
 
-class GapRows(NamedTuple):
-    """What n samples of orientations show of the gap between two points."""
-
-    gap: np.ndarray  # (n, 3) [m] in W, from the second point to the first one
-    H: np.ndarray  # (n, 3, k) [m/rad] its slope by the headings
-    by_shape: np.ndarray  # (n, 3, m) by the lengths and the girdles' parameters, as in `Subject.shape_covariance`
-    by_attitude: np.ndarray  # (n, 3, 3) [m²] its covariance by errors of 1 rad of each orientation about each axis
-    off_law: np.ndarray  # (n, 3, 3) [m²] its covariance by shoulders that leave the law of their girdles
-
-
 class PointPair:
     """Two points of a body that coincide at times.
 
@@ -209,7 +199,16 @@ class PointPair:
         outputs = [ca.densify(each) for each in rows]
         self._gap = ca.Function("rows", [quat, headings, shape], outputs, {"cse": True})
 
-    def linearize(self, quat_WL: np.ndarray, headings: np.ndarray) -> GapRows:
-        """Linearize the gap of orientations (n, k, 4) at heading errors (k,) [rad]."""
+    def linearize(self, quat_WL: np.ndarray, headings: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Linearize the gap of orientations (n, k, 4) at heading errors (k,) [rad].
+
+        Returns
+        -------
+        gap : (n, 3) [m] in W, from the second point to the first one
+        H : (n, 3, k) [m/rad] its slope by the headings
+        by_shape : (n, 3, m) by the lengths and the girdles' parameters, as in `Subject.shape_covariance`
+        by_attitude : (n, 3, 3) [m²] its covariance by errors of 1 rad of each orientation about each axis
+        off_law : (n, 3, 3) [m²] its covariance by shoulders that leave the law of their girdles
+        """
         gap, *others = evaluate(self._gap, quat_WL.reshape(len(quat_WL), -1), headings, self._shape)
-        return GapRows(gap[:, :, 0], *others)
+        return gap[:, :, 0], *others

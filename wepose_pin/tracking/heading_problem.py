@@ -1,8 +1,7 @@
-"""The problem of the heading filter: what observes the headings, the noise of that, and the states.
+"""The problem of the heading filter: what observes the headings of a recording, and the noise of that.
 
-δ (k,) [rad] are the heading errors of the k segments with sensors, on the left in W. Time is cut into intervals of
-equal length, the knots. Headings are observed by joints between two sensors, by hinges and by joined palms
-(`wepose_pin.observations`).
+Time is cut into intervals of equal length, the knots. Headings are observed by joints between two sensors, by hinges
+and by joined palms (`wepose_pin.observations`).
 """
 
 from __future__ import annotations
@@ -10,8 +9,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -75,64 +72,11 @@ MECHANISM_NOISE = HeadingNoise(
 )
 
 
-class FilterHeadings(NamedTuple):
-    """What the orientation filters of k sensors know of their headings after a sample; NaN without a covariance.
-
-    Parameters
-    ----------
-    var : (k,) [rad²] of the heading
-    heading, rate, rate_var : (k,) as the columns of `FilterRun.about_vertical`
-    """
-
-    var: np.ndarray
-    heading: np.ndarray
-    rate: np.ndarray
-    rate_var: np.ndarray
-
-
-class Knot(NamedTuple):
-    """The samples of a knot, with uncorrected headings."""
-
-    quat_WL: np.ndarray  # (m, k, 4) xyzw of L'
-    sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `compute_sides`, band-passed
-    filters: FilterHeadings  # at the end
-    lost: np.ndarray  # (k,) bool: the sensor has lost a sample
-    clasped: np.ndarray  # (m,) bool: the palms are joined
-
-
-class StateColumns(NamedTuple):
-    """The columns of the states of a heading filter, of k segments, j joints and h hinges."""
-
-    heading: np.ndarray  # (k,) δ [rad]
-    rate: np.ndarray  # (k,) [rad/s] at which δ drifts
-    joint: np.ndarray  # (j,) [rad] of the heading by a joint's acceleration
-    axis: np.ndarray  # (h,) [rad] of a hinge's axis about the long axis of the segment above
-    twist: np.ndarray  # (h,) [rad] of the sensor on that segment about its long axis
-    tilt: np.ndarray  # (h,) [rad] of a hinge's axis about the direction across
-    mount: np.ndarray  # (k,) [rad] of a mount's heading
-    force: np.ndarray  # (k, 3) [m/s²] fixed in the sensor's frame
-    delay: np.ndarray  # (k,) [s] of the accelerometer
-    start: np.ndarray  # (k,) [rad] of the segment's heading in the start pose
-    lever: np.ndarray  # (j, 6) [m] of the near and the far sensor from the joint
-
-    @classmethod
-    def lay_out(cls, k: int, j: int, h: int) -> StateColumns:
-        shapes = [(k,), (k,), (j,), (h,), (h,), (h,), (k,), (k, 3), (k,), (k,), (j, 6)]
-        sizes = [int(np.prod(shape)) for shape in shapes]
-        parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        return cls(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
-
-    @property
-    def size(self) -> int:
-        """Number of states."""
-        return sum(columns.size for columns in self)
-
-
 @dataclass(frozen=True)
 class HeadingProblem:
     """What observes the headings of a recording, and how well they are known at the start."""
 
-    names: tuple[str, ...]  # k segments, in the order of δ
+    names: tuple[str, ...]  # k segments with sensors
     model: BodyModel
     subject: Subject
     pairs: tuple[JointPair, ...]  # joints between two sensors
@@ -163,34 +107,6 @@ class HeadingProblem:
     def rate_hz(self) -> float:
         """Of a knot's samples."""
         return self.samples_per_knot / self.knot_s
-
-    @cached_property
-    def columns(self) -> StateColumns:
-        return StateColumns.lay_out(len(self.names), len(self.pairs), len(self.hinges))
-
-    @cached_property
-    def shape_cov(self) -> np.ndarray:
-        """The covariance of the lengths and of the girdles' parameters, as `Subject.shape_covariance`."""
-        return self.subject.shape_covariance(self.model.table)
-
-    @cached_property
-    def pair_columns(self) -> list[np.ndarray]:
-        """The columns (17,) of each joint: headings of its segments, joint; lever, force and delay near and far."""
-        c, pair_columns = self.columns, []
-        for i, pair in enumerate(self.pairs):
-            near, far = self.names.index(pair.near), self.names.index(pair.far)
-            sides = [(*c.lever[i, :3], *c.force[near], c.delay[near]), (*c.lever[i, 3:], *c.force[far], c.delay[far])]
-            pair_columns.append(np.array([near, far, c.joint[i], *sides[0], *sides[1]]))
-        return pair_columns
-
-    @cached_property
-    def hinge_columns(self) -> list[np.ndarray]:
-        """The columns (5,) of each hinge: headings of the segments below and above, axis, twist, tilt."""
-        c, index = self.columns, self.names.index
-        return [
-            np.array([index(hinge.moves), index(hinge.on), c.axis[i], c.twist[i], c.tilt[i]])
-            for i, hinge in enumerate(self.hinges)
-        ]
 
 
 def make_heading_problem(

@@ -19,8 +19,8 @@ from .. import rotations
 from ..body.mounts import StartPose, compute_start_heading_var
 from ..filters.butterworth import BandPass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
-from .heading_filter import HeadingEstimate, HeadingFilter, Process, estimate_headings, find_care, symmetric
-from .heading_problem import FilterHeadings, HeadingProblem, Knot
+from .heading_filter import HeadingFilter, symmetric
+from .heading_problem import HeadingProblem
 from .segment_orientations import SegmentOrientations, correct_covariance
 
 E_Z = np.array([0.0, 0.0, 1.0])
@@ -92,10 +92,9 @@ class HeadingCorrection:
         Neighbours share what one tells of the other. Where `segment_cov` (n, 3, 3) [rad²] in W, given for each segment,
         states less than the heading filter knew, the correlation stays and the covariance shrinks.
         """
-        rows = {name: i for i, name in enumerate(self.segments) if name in segment_cov}
+        rows, scale = {name: i for i, name in enumerate(self.segments) if name in segment_cov}, {}
         if not len(self.time):
             return {}
-        scale = {}
         for name, i in rows.items():
             # As much as the heading is uncertain where the tilt is known may be shared with other segments.
             own = np.linalg.det(segment_cov[name]) / np.linalg.det(segment_cov[name][:, :2, :2])
@@ -126,16 +125,17 @@ class HeadingCorrector:
     Parameters
     ----------
     offset : (k,) ψ [rad] to which corrections are added
-    start : what the orientation filters know at the end of the start pose
+    start : (4, k) what the orientation filters know at the end of the start pose, as in `HeadingFilter`
     begin : [s] the time of the first sample
 
     Attributes
     ----------
+    fade : how the correction fades in: from and to (k,) [rad], number of the next sample, number of samples
     variance : (3, k) [rad²] after the last knot: variances of each segment's heading and of its filter's alone, and
         the squared correction of the headings since the start or the last reset
     """
 
-    def __init__(self, problem: HeadingProblem, offset: np.ndarray, start: FilterHeadings, begin: float) -> None:
+    def __init__(self, problem: HeadingProblem, offset: np.ndarray, start: np.ndarray, begin: float) -> None:
         k = len(problem.names)
         self.problem, self.offset, self._begin_s = problem, offset, begin
         self._quat_WV = rotations.rotation_about(E_Z, offset)
@@ -143,7 +143,7 @@ class HeadingCorrector:
         self._accelerations = JointAccelerationFilter(k, problem.sensor_rate_hz) if problem.pairs else None
         self._size = problem.stride * problem.samples_per_knot
         self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if problem.causal else 0
-        self._samples = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
+        self._quat_VS, self._accel_S = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
         self._clasped = np.zeros(self._size, dtype=bool)
         self._count = self._knots = 0  # samples in the open knot, knots before it
         self._knot_end, self._records = begin, False  # of the last knot: its end [s], whether it is recorded
@@ -152,14 +152,13 @@ class HeadingCorrector:
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot that is solved
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
-        self._history: list[HeadingEstimate] = []  # causally, of the knots
-        self._states: list[tuple[np.ndarray, np.ndarray, Process]] = []  # offline: x, P, and what led to them
+        # Of each knot: causally what was corrected, as `HeadingFilter.estimate`; offline x, P, and what led to them.
+        self._history: list[tuple[Any, ...]] = []
         self._update_estimate()
         self._update_variance()
 
     @property
     def fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
-        """How the correction fades in: from (k,) [rad], to (k,) [rad], number of the next sample, number of samples."""
         if self._count < self._lead:
             return self._to, self._to, 0, 1
         return self._from, self._to, self._count - self._lead, self._size - self._lead
@@ -178,7 +177,7 @@ class HeadingCorrector:
         clasped : (n,) bool: the palms are joined
         """
         rows = slice(self._count, self._count + len(quat_VS))
-        self._samples[0][rows], self._samples[1][rows], self._clasped[rows] = quat_VS, accel_S, clasped
+        self._quat_VS[rows], self._accel_S[rows], self._clasped[rows] = quat_VS, accel_S, clasped
         self._count += len(quat_VS)
         if self._solving is not None:
             if self._count >= self._lead:
@@ -187,41 +186,39 @@ class HeadingCorrector:
                 next(self._solving, None)
         return self._count == self._size
 
-    def close(self, filters: FilterHeadings, *, end: float | None = None, record: bool = False) -> None:
-        """Close the open knot; `filters` is after its last sample.
+    def close(self, filters: np.ndarray, *, end: float | None = None, record: bool = False) -> None:
+        """Close the open knot; `filters` (4, k) is after its last sample.
 
         `end` [s] is the time of that sample, None: by the number of samples; `record`: keep the result for `collect`.
         """
         samples = self._knots * self._size + self._count - 1
         self._knot_end = self._begin_s + samples / self.problem.sensor_rate_hz if end is None else end
-        quat_VS, accel_S = (values[: self._count].copy() for values in self._samples)
-        clasped = self._clasped[: self._count : self.problem.stride].copy()
-        self._solving = self._solve(quat_VS, accel_S, clasped, filters)
+        knot = (values[: self._count].copy() for values in (self._quat_VS, self._accel_S, self._clasped))
+        self._solving = self._solve(*knot, filters)
         self._count, self._knots, self._records = 0, self._knots + 1, record
         if not self._lead:
             self._apply()
 
     def _solve(
-        self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray, filters: FilterHeadings
+        self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray, filters: np.ndarray
     ) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
-        problem, rows = self.problem, slice(None, None, self.problem.stride)
+        problem, rows, k = self.problem, slice(None, None, self.problem.stride), len(self.offset)
         quat_WS = rotations.multiply(self._quat_WV, quat_VS)
-        sides = np.zeros((0, len(problem.names), 3, 8))
+        sides = np.zeros((0, k, 3, 8))
         if self._accelerations is not None:
-            R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(*quat_WS.shape[:2], 3, 3)
+            R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(-1, k, 3, 3)
             sides = self._accelerations.push(R_WS, accel_S)[rows]
-        lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
+        lost = ~np.isfinite(accel_S).all(axis=(0, 2))
         quat_WL = rotations.multiply(quat_WS[rows], problem.quat_SL)
-        knot = Knot(quat_WL, sides, filters, lost, clasped)
         yield
-        yield from self._filter.step(knot)
-        if not problem.causal:
-            self._states.append((self._filter.x, self._filter.P, self._filter.process))
+        yield from self._filter.step(quat_WL, sides, clasped[rows], lost, filters)
+        if problem.causal:
+            self._update_estimate()
+            self._var_at_knot = np.nan_to_num(filters[0])
+        else:
+            self._history.append((self._filter.x, self._filter.P, self._filter.process))
             self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / problem.sensor_rate_hz)
-            return
-        self._update_estimate()
-        self._var_at_knot = np.nan_to_num(filters.var)
 
     def _apply(self) -> None:
         """Finish the last knot; causally its correction fades in from the next sample on."""
@@ -232,14 +229,14 @@ class HeadingCorrector:
         self._solving = None
         if not self.problem.causal:
             return
-        self._from, self._to = self._to, self._estimate.errors.copy()
-        measured = self.problem.measured
+        errors, covariance, segment_covariance = self._estimate
+        self._from, self._to, measured = self._to, errors.copy(), self.problem.measured
         if measured.any() and not self._corrects_measured:
-            self._corrects_measured = exceed_uncertainty(self._to[None], self._estimate.covariance[None])
+            self._corrects_measured = exceed_uncertainty(self._to[None], covariance[None])
             self._to[measured] *= self._corrects_measured
         if self._records:
             self._times.append(self._knot_end)
-            self._history.append(self._estimate._replace(errors=self._to))
+            self._history.append((self._to, covariance, segment_covariance))
         self._update_variance()
 
     def reset(self, heading_offset: np.ndarray) -> None:
@@ -255,70 +252,61 @@ class HeadingCorrector:
 
     def _update_estimate(self) -> None:
         x, P = self._filter.x, self._filter.P
-        self._estimate = estimate_headings(self.problem, x, P, find_care(self.problem, x, P))
+        self._estimate = self._filter.estimate(x, P, self._filter.find_care(x, P))
 
     def _update_variance(self) -> None:
-        var = np.diag(self._estimate.segment_covariance)
+        var = np.diag(self._estimate[2])
         self.variance = np.array([var, self._var_at_knot, (self._to - self._at_reset) ** 2])
 
     def collect(self) -> HeadingCorrection:
         """Return what was observed and corrected causally so far."""
-        k = len(self.problem.names)
-        return HeadingCorrection(
-            self.problem,
-            np.array(self._times),
-            np.array([each.errors for each in self._history]).reshape(-1, k),
-            np.array([each.covariance for each in self._history]).reshape(-1, k, k),
-            np.array([each.segment_covariance for each in self._history]).reshape(-1, k, k),
-        )
+        return self._stack(self._history)
 
-    def smooth(self, filters: FilterHeadings, end: float) -> HeadingCorrection | None:
-        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` after the last sample at `end` [s].
+    def _stack(self, knots: list[tuple[Any, ...]]) -> HeadingCorrection:
+        k = len(self.offset)
+        columns = zip(((k,), (k, k), (k, k)), zip(*knots, strict=True) if knots else ((), (), ()), strict=True)
+        values = (np.array(values).reshape(-1, *shape) for shape, values in columns)
+        return HeadingCorrection(self.problem, np.array(self._times), *values)
+
+    def smooth(self, filters: np.ndarray, end: float) -> HeadingCorrection | None:
+        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` (4, k) after the last sample at `end` [s].
 
         None: there is no knot.
         """
-        problem, forward = self.problem, self._filter
+        forward, measured = self._filter, self.problem.measured
         if self._count:
             self.close(filters, end=end)
         if not self._times:
             return None
-        x, P, process = self._states[-1]
-        care = find_care(problem, x, P)
-        estimates = [estimate_headings(problem, x, P, care)]
-        for before_x, before_P, process_before in self._states[-2::-1]:
+        x, P, process = self._history[-1]
+        care = forward.find_care(x, P)
+        estimates = [forward.estimate(x, P, care)]
+        for before_x, before_P, process_before in self._history[-2::-1]:
             forward.x, forward.P = before_x, before_P
             forward.predict(process)
             gain = np.linalg.solve(forward.P, forward.advance(before_P)).T
             x = before_x + gain @ (x - forward.x)
             P = symmetric(before_P + gain @ (P - forward.P) @ gain.T)
-            estimates.append(estimate_headings(problem, x, P, care))
+            estimates.append(forward.estimate(x, P, care))
             process = process_before
-        smoothed = HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True)))
-        if problem.measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
-            smoothed.errors[:, problem.measured] = 0.0
-        return HeadingCorrection(problem, np.array(self._times), *smoothed)
+        smoothed = self._stack(estimates[::-1])
+        if measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
+            smoothed.errors[:, measured] = 0.0
+        return smoothed
 
 
 def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
     """Return whether a combination of corrections exceeds its own standard deviation, at one of the knots.
 
-    Otherwise measured orientations are used as they are: what corrects them is less than what is not known.
-
-    Parameters
-    ----------
-    errors, covariance : (m, k) [rad], (m, k, k) [rad²] of all headings at the knots
+    Otherwise measured orientations are used as they are: what corrects them is less than what is not known. `errors`
+    are (m, k) [rad] and `covariance` (m, k, k) [rad²] of all headings at the knots.
     """
     weighted = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
     return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
 
 
 class JointAccelerationFilter:
-    """The side B of each sensor at its joints, band-passed, from samples of all sensors; it runs on from call to call.
-
-    Parameters
-    ----------
-    sensors : number of them
-    """
+    """The side B of each of k sensors at its joints, band-passed; it runs on from call to call."""
 
     def __init__(self, sensors: int, rate_hz: float) -> None:
         self._rate_hz = rate_hz
@@ -328,10 +316,7 @@ class JointAccelerationFilter:
     def push(self, R_WS: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Return B (n, k, 3, 8), one sample late; where a sensor has lost samples it is of no use.
 
-        Parameters
-        ----------
-        R_WS : (n, k, 3, 3)
-        accel_S : (n, k, 3) [m/s²], NaN where lost
+        `R_WS` is (n, k, 3, 3), `accel_S` (n, k, 3) [m/s²], NaN where lost.
         """
         accel_S = np.concatenate([self._last_accel_S, accel_S])
         lost = ~np.isfinite(accel_S).all(axis=2)

@@ -32,7 +32,7 @@ from ..filters.sensors import SensorFilters, find_start_orientations
 from ..recording import ImuSensor, OrientationSensor, Recording, Sensor
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
-from .heading_problem import CLASP, FilterHeadings, make_heading_problem
+from .heading_problem import CLASP, make_heading_problem
 from .headings import E_Z, HeadingCorrection, HeadingCorrector
 from .segment_orientations import (
     SegmentOrientations,
@@ -54,10 +54,10 @@ class FilterOutput(NamedTuple):
     attitude_cov: np.ndarray  # (n, k, 3, 3) [rad²]
     about_vertical: np.ndarray  # (n, k, 3) as in `FilterRun`
 
-    def at(self, row: int) -> FilterHeadings:
-        """What the filters know of their headings after a sample."""
+    def at(self, row: int) -> np.ndarray:
+        """What the filters know of their headings after a sample (4, k), as in `HeadingFilter`."""
         variance = compute_heading_variance(self.quat_VS[row], self.attitude_cov[row])
-        return FilterHeadings(variance, *self.about_vertical[row].T)
+        return np.vstack([variance, self.about_vertical[row].T])
 
 
 class SegmentEstimator:
@@ -131,7 +131,7 @@ class SegmentEstimator:
         self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
         self._recent = np.empty((0, k, 4))  # orientations of the last `RESET_S`
         self._oldest = 0  # row of `_recent` with the oldest sample
-        self._filter_headings: FilterHeadings  # after the last chunk
+        self._filter_headings: np.ndarray  # after the last chunk
         self._end_s: float  # [s] the same
         self.quat_WL = np.zeros((k, 4))
         self._uncorrected = np.zeros(k)
