@@ -181,7 +181,7 @@ class HeadingFilter:
             x = np.asarray(self.x + np.linalg.solve(identity + self.P @ self._matrix, right))
             yield
         self.x, self.P = x, symmetric(np.linalg.solve(identity + self.P @ self._matrix, self.P))
-        self._misfits, self._clasped_before, self._last, self._lost_before = misfits, clasped.any(), filters, lost
+        self._misfits, self._clasped_before, self._last, self._lost_before = misfits, bool(clasped.any()), filters, lost
 
     def _find_process(self, filters: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find how the state changes within a knot, and the variance of that.

@@ -193,8 +193,8 @@ class HeadingCorrector:
         """
         samples = self._knots * self._size + self._count - 1
         self._knot_end = self._begin_s + samples / self.problem.sensor_rate_hz if end is None else end
-        knot = (values[: self._count].copy() for values in (self._quat_VS, self._accel_S, self._clasped))
-        self._solving = self._solve(*knot, filters)
+        n = slice(self._count)
+        self._solving = self._solve(self._quat_VS[n].copy(), self._accel_S[n].copy(), self._clasped[n].copy(), filters)
         self._count, self._knots, self._records = 0, self._knots + 1, record
         if not self._lead:
             self._apply()
