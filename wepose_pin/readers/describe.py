@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,7 +101,6 @@ def _describe_data(proposal: Proposal, model: Path | None) -> Description:
     """Describe data by what a proposed session reads, with this session."""
     recording = proposal.read() if proposal.sensors else None
     about = Description(f"{proposal.path}: {proposal.title}", tuple(proposal.facts))
-    about = about._replace(diagnostics=tuple(proposal.diagnostics))
     if not proposal.sensors:
         return about
     about = about._replace(session=format_session(proposal, model, recording), then="mend what cannot be read")
@@ -119,9 +118,9 @@ def _describe_data(proposal: Proposal, model: Path | None) -> Description:
         then = f"take the # off the lines of each sensor with ? and write its segment in place of SEGMENT; then {then}"
     return about._replace(
         facts=(*about.facts, *_list_facts(recording)),
-        sensors=_list_sensors(recording, proposal.labels),
+        sensors=_list_sensors(recording, proposal.sensors),
         then=then,
-        diagnostics=(*about.diagnostics, *read),
+        diagnostics=tuple(read),
     )
 
 
@@ -162,7 +161,7 @@ def _list_facts(recording: Recording) -> tuple[str, ...]:
     return tuple(facts)
 
 
-def _list_sensors(recording: Recording, labels: Mapping[str, str]) -> tuple[tuple[str, ...], ...]:
+def _list_sensors(recording: Recording, keys: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[str, ...], ...]:
     rows = []
     for segment, sensor in recording.sensors.items():
         fastest = np.degrees(np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1).max())
@@ -171,7 +170,7 @@ def _list_sensors(recording: Recording, labels: Mapping[str, str]) -> tuple[tupl
             holds, gravity = "gyro, accel", f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
         lost = [b - a for a, b in find_runs(sensor.gap)] if sensor.gap is not None else []
         gaps = f"{len(lost)}, up to {max(lost) / recording.rate_hz:.2f} s" if lost else "none"
-        known = not segment.startswith("?")
-        label = labels.get(segment, "" if known else segment[1:])
-        rows.append((segment if known else "?", label, holds, f"{fastest:.0f} deg/s", gravity, gaps))
+        unknown, own = segment.startswith("?"), keys.get(segment, {})
+        label = own.get("label") or own.get("file") or (segment[1:] if unknown else "")
+        rows.append(("?" if unknown else segment, label, holds, f"{fastest:.0f} deg/s", gravity, gaps))
     return tuple(rows)

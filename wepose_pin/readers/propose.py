@@ -15,8 +15,6 @@ import polars as pl
 
 from ..body import BodyTable
 from ..data_tables import read_columns, read_names, read_table
-from ..diagnostics import ERROR, WARNING, Diagnostic
-from ..documents import toml_key, toml_string, toml_strings
 from ..errors import BadData, MissingRate, WeposeError, WrongUnit, one_of
 from ..recording import AXES, CONFIGURATION, ImuSensor, Intervals, Recording
 from ..recording.clocks import TIME_UNITS, guess_time_unit
@@ -29,6 +27,7 @@ from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .registry import detect_format, look_up_format, read_device
 from .session import read_session
+from .session_file import format_keys
 
 # A line of a file that says its rate.
 _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,12}(?P<rate>\d+(\.\d+)?)", re.IGNORECASE)
@@ -50,22 +49,13 @@ class Proposal:
     title: str  # kind of file
     data: dict[str, Any] = field(default_factory=dict)  # keys of [data]
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # segment, or "?" and a name of the file → keys
-    checks: dict[tuple[str, str], str] = field(default_factory=dict)  # (table, key) → what the user has to check there
-    labels: dict[str, str] = field(default_factory=dict)  # segment → its name in the file
+    checks: dict[str, str] = field(default_factory=dict)  # key → what the user has to check there
     facts: list[str] = field(default_factory=list)  # from the file, one line each
-    diagnostics: list[Diagnostic] = field(default_factory=list)
     phases: Mapping[str, Intervals] = field(default_factory=dict)  # that the file states
 
     def relative(self, path: Path) -> str:
         """Return a path as the session names it."""
         return Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix()
-
-    def warn_of_unknown(self, place: str, names: Mapping[str, str]) -> None:
-        """Say which sensors are on segments that are not known; `names`: what to call those without a name."""
-        unknown = [name.removeprefix("?") or names[name] for name in self.sensors if name.startswith("?")]
-        if unknown:
-            facts: dict[str, float | str] = {"variant": "unnamed", "devices": ", ".join(unknown)}
-            self.diagnostics.append(Diagnostic("sensors-left-out", WARNING, place, len(unknown), facts=facts))
 
     def read(self) -> Recording | None:
         """Read the recording as a session file would, and settle units; None: the data cannot be read.
@@ -78,10 +68,9 @@ class Proposal:
                 return read_session(self.folder / "session.toml", True, values)
             except WrongUnit as error:  # the reader's check of units is better than a guess from names
                 self.data[error.key] = error.unit
-                self.checks.pop(("data", error.key), None)
+                self.checks.pop(error.key, None)
             except WeposeError as error:
-                unread = Diagnostic("session-unreadable", ERROR, self.path.name, facts={"reason": str(error)})
-                self.diagnostics.append(unread)
+                self.facts.append(f"as the session proposes it, it cannot be read: {error}")
                 break
         return None
 
@@ -92,7 +81,7 @@ class Proposal:
 def propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) -> Proposal:
     """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
     format = look_up_format(name)
-    device, _ = _read(path, name)
+    device, lacks_rate = _read(path, name)
     signals = "gyroscope and accelerometer" if device.kind == "raw" else "orientations, no raw data"
     proposal = Proposal(path, folder, body, f"{format.title}, {signals}")
     whole = len(device.sensors) > 1 or format.whole
@@ -100,30 +89,25 @@ def propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) ->
         proposal.data["file"] = proposal.relative(path)
     else:
         proposal.data["format"] = proposal.relative(Path(name)) if name.endswith(".toml") else name
-    without_rate = []
     for file in [path] if whole else _list_siblings(path, name):
         try:
-            device, lacks_rate = _read(file, name)
+            device, lacks = _read(file, name)
         except WeposeError as error:
-            facts: dict[str, float | str] = {"variant": "unreadable", "reason": str(error)}
-            proposal.diagnostics.append(Diagnostic("sensors-left-out", WARNING, file.name, facts=facts))
+            proposal.facts.append(f"{file.name} is left out, as it cannot be read: {error}")
             continue
+        lacks_rate |= lacks
         for label, sensor in device.sensors.items():
-            texts = (label, file.stem) if len(device.sensors) == 1 else (label,)
-            guesses = filter(None, map(body.guess_segment, texts))
-            segment: str | None = sensor.segment if sensor.segment in body.segments else next(guesses, None)
+            guesses = map(body.guess_segment, (label, file.stem) if len(device.sensors) == 1 else (label,))
+            segment: str | None = (
+                sensor.segment if sensor.segment in body.segments else next(filter(None, guesses), None)
+            )
             where = segment if segment and segment not in proposal.sensors else f"?{label if whole else file.name}"
             proposal.sensors[where] = {"label": label} if whole else {"file": proposal.relative(file)}
-            proposal.labels[where] = label
-            without_rate += [where] if lacks_rate else []
-    for_all = len(without_rate) == len(proposal.sensors)  # one line holds for all
-    for where in ["data"] if for_all and without_rate else without_rate:
-        (proposal.data if where == "data" else proposal.sensors[where])["rate_hz"] = ASSUMED_RATE_HZ
-        proposal.checks[where, "rate_hz"] = "the file does not say its rate"
-    proposal.warn_of_unknown(path.name if whole else path.parent.name, {})
-    known = [where for where in proposal.sensors if not where.startswith("?")]
-    if not whole and len(known) > 1:
-        proposal.title += f", {len(known)} files"
+    if lacks_rate:
+        proposal.data["rate_hz"] = ASSUMED_RATE_HZ
+        proposal.checks["rate_hz"] = "the file does not say its rate"
+    if not whole and len(proposal.sensors) > 1:
+        proposal.title += f", {len(proposal.sensors)} files"
     if name == "wepose_live":
         log = read_live_log(path)
         proposal.facts.append(f"of {log.header['name']}, live by {log.header['method']}: {len(log.quat_WL)} poses")
@@ -177,14 +161,13 @@ def propose_from_names(path: Path, folder: Path, body: BodyTable, content: Array
     if any("gyro" in signals for signals in guess.sensors.values()):
         proposal.data["gyro_unit"] = guess.units.get("gyro", "rad/s")
         if "gyro" not in guess.units:
-            proposal.checks["data", "gyro_unit"] = "neither the file nor the motion says so"
+            proposal.checks["gyro_unit"] = "neither the file nor the motion says so"
         proposal.data["accel_unit"] = guess.units.get("accel", "m/s^2")
     for segment, signals in guess.sensors.items():
         keys = {signal: columns if len(columns) > 1 else columns[0] for signal, columns in signals.items()}
         proposal.sensors[segment] = keys
         if content and "orientation" in keys:
-            w_first = toml_strings(f"{keys['orientation']}[{k}]" for k in (1, 2, 3, 0))
-            proposal.checks[segment, "orientation"] = f"x, y, z, w? if w comes first: {w_first}"
+            proposal.checks["orientation"] = "x, y, z, w? if w comes first, name its columns [1], [2], [3], [0]"
     # A table with one sensor, whose segment is that of the file's name, has others beside it with the same columns.
     own = body.guess_segment(path.stem) if content is None and len(guess.sensors) == 1 else None
     if own and next(iter(guess.sensors)).startswith("?"):
@@ -194,13 +177,10 @@ def propose_from_names(path: Path, folder: Path, body: BodyTable, content: Array
             with contextlib.suppress(WeposeError):
                 if other and other not in files and read_names(file)[0] == names:
                     files[other] = file
-        ((_, keys),) = proposal.sensors.items()
         proposal.sensors = {segment: {"file": proposal.relative(file), **keys} for segment, file in files.items()}
         proposal.title += f", {len(files)} files" if len(files) > 1 else ""
-        return proposal
-    proposal.data = {"file": proposal.relative(path), **proposal.data}
-    first = {name: f"{next(iter(signals.values()))[0]}, …" for name, signals in guess.sensors.items()}
-    proposal.warn_of_unknown(path.name, first)
+    else:
+        proposal.data = {"file": proposal.relative(path), **proposal.data}
     return proposal
 
 
@@ -213,9 +193,8 @@ def _propose_time(proposal: Proposal, guess: Guess, arrays: ArrayFile | None) ->
             time = read_columns(table, [name], place, "time")[:, 0]
             break
     else:
-        _propose_rate(
-            proposal, table.select(*dict.fromkeys(guess.times)), () if arrays else read_first_lines(proposal.path)
-        )
+        dates = table.select(*dict.fromkeys(guess.times))
+        _propose_rate(proposal, dates, () if arrays else read_first_lines(proposal.path))
         return
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
@@ -227,7 +206,7 @@ def _propose_time(proposal: Proposal, guess: Guess, arrays: ArrayFile | None) ->
         proposal.facts.append(f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):.4g} Hz")
         proposal.data["time_unit"] = unit
         if unit != named:
-            proposal.checks["data", "time_unit"] = reason
+            proposal.checks["time_unit"] = reason
 
 
 def _propose_rate(proposal: Proposal, dates: pl.DataFrame, lines: Sequence[str]) -> None:
@@ -247,8 +226,7 @@ def _propose_rate(proposal: Proposal, dates: pl.DataFrame, lines: Sequence[str])
     if stated:
         proposal.facts.append(f"no column looks like time; the file says '{stated[0]}'")
     else:
-        proposal.facts.append("no column of times in numbers: state the rate")
-        proposal.checks["data", "rate_hz"] = "no column looks like time"
+        proposal.checks["rate_hz"] = "no column looks like time"
 
 
 # The file ----------------------------------------------------------------------------------------------------------
@@ -268,11 +246,10 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
         mean = rate.mean(axis=1, keepdims=True)
         # A bias is below the rate of a person who rotates evenly.
         static &= np.linalg.norm(mean[:, 0], axis=1) < 3.0 * STATIC_GYRO
-        about = rate
         if isinstance(sensor, ImuSensor):
-            about = rate - mean
+            rate = rate - mean
             static &= np.sqrt(split(sensor.accel_S).var(axis=1).sum(axis=1)) < STATIC_ACCEL
-        static &= np.sqrt((about**2).sum(axis=2).mean(axis=1)) < STATIC_GYRO
+        static &= np.sqrt((rate**2).sum(axis=2).mean(axis=1)) < STATIC_GYRO
         if sensor.gap is not None:
             static &= ~split(sensor.gap).any(axis=1)
     spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
@@ -286,52 +263,48 @@ def format_session(proposal: Proposal, model: Path | None, recording: Recording 
     """
     body, segments = proposal.body, list(proposal.body.segments)
     static = find_static_intervals(recording) if recording is not None else []
-    lines = [f"name = {toml_string(proposal.path.stem)}"]
+    head = {"name": proposal.path.stem}
     if model is not None:
-        lines.append(f"model = {toml_string(proposal.relative(model) if model.is_file() else str(model))}")
-    lines += ['start_pose = "n_pose"', "", "[data]", *_format_keys(proposal, "data", proposal.data)]
+        head["model"] = proposal.relative(model) if model.is_file() else str(model)
+    lines = [*format_keys({**head, "start_pose": "n_pose"}), "", "[data]", *format_keys(proposal.data, proposal.checks)]
     lines += ["", "[phases]   # seconds"]
-    for name, spans in proposal.phases.items():
-        listed = ", ".join(f"[{np.ceil(1e3 * a) / 1e3:.3f}, {np.floor(1e3 * b) / 1e3:.3f}]" for a, b in spans)
-        lines.append(f"{toml_key(name)} = [{listed}]   # as it was marked live")
-    if not proposal.phases and recording is not None:
+    if proposal.phases:  # as they were marked live
+        inside = {
+            name: [(np.ceil(1e3 * a) / 1e3, np.floor(1e3 * b) / 1e3) for a, b in spans]
+            for name, spans in proposal.phases.items()
+        }
+        lines += format_keys(inside)
+    elif recording is not None:
         lines += _propose_phases(proposal, recording, static)
     for segment in sorted(proposal.sensors, key=lambda name: segments.index(name) if name in segments else 99):
+        known = segment in segments
         place = body.sensors[segment].place if segment in body.sensors else ""
-        name = segment if segment in segments else "SEGMENT"
-        table = [f"[sensors.{name}]{f'   # usually {place}' if place else ''}"]
-        table += _format_keys(proposal, segment, proposal.sensors[segment])
+        table = [f"[sensors.{segment if known else 'SEGMENT'}]{f'   # usually {place}' if place else ''}"]
+        table += format_keys(proposal.sensors[segment], proposal.checks)
         if recording is not None and not recording.sensors[segment].aligned:
             table.append(_propose_mount(recording, segment, static))
-        lines += ["", *(line if segment in segments else f"# {line}" for line in table)]
+        lines += ["", *(line if known else f"# {line}" for line in table)]
     return "\n".join(lines) + "\n"
-
-
-def _format_keys(proposal: Proposal, table: str, values: Mapping[str, Any]) -> Iterator[str]:
-    for key, value in values.items():
-        text = toml_string(value) if isinstance(value, str) else str(value)
-        check = proposal.checks.get((table, key))
-        yield f"{key} = {toml_strings(value) if isinstance(value, list) else text}" + (
-            f"   # CHECK: {check}" if check else ""
-        )
 
 
 def _propose_phases(proposal: Proposal, recording: Recording, static: Sequence[tuple[float, float]]) -> Iterator[str]:
     """Propose the start phase where all sensors are static, else an example; and an example of a clasp."""
-
-    def example(begin: float, end: float) -> str:
-        return f"[[{np.ceil(10.0 * begin) / 10.0:.1f}, {np.floor(10.0 * end) / 10.0:.1f}]]"
-
     begin, end = float(recording.time[0]), float(recording.time[-1])
     if static:
         spans = f"[[{static[0][0]:.2f}, {static[0][1]:.2f}]]"
         yield f"start = {spans}   # CHECK: all sensors are static there; is it the start pose?"
-    elif end - begin > 2.0:
+    if end - begin < 2.0:
+        return
+
+    def example(first: float, last: float) -> str:
+        return f"[[{np.ceil(10.0 * first) / 10.0:.1f}, {np.floor(10.0 * last) / 10.0:.1f}]]"
+
+    if not static:
         spans = example(begin + 0.5, min(begin + 4.5, end))
         yield f"# start = {spans}   # name the seconds in which the person stands still in the start pose"
     body, sensors = proposal.body, set(proposal.sensors)
     lacking = sensors <= set(body.segments) and set(body.needed) - sensors  # else an unknown one may be a needed one
-    if end - begin > 2.0 and body.draw.paths and not lacking:
+    if body.draw.paths and not lacking:
         spans = example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
         yield f"# clasp = {spans}   # for wepose calibrate: the seconds in which the palms are held together"
 

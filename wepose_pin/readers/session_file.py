@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -10,7 +11,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from ..body.table import NEUTRAL_POSE
-from ..documents import Key, TomlTable, is_number, read_record, read_toml
+from ..documents import Key, TomlTable, is_number, read_record, read_toml, toml_key, toml_string
 from ..errors import BadPhase, BadSession, MissingFile, printable
 from ..recording import CONFIGURATION, Intervals, Recording, compute_mount
 from ..recording.clocks import TIME_UNITS
@@ -172,3 +173,19 @@ def check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys
                     f"{tables[name].at(signal)}: '{column}' of {each.file} is a column of sensors.{owner} too; "
                     f"each sensor needs its own"
                 )
+
+
+def format_keys(keys: Mapping[str, Any], checks: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+    """Format the keys of a table, one a line; `checks`: key → what the user has to check there."""
+    return [
+        f"{toml_key(key)} = {_format_value(value)}" + (f"   # CHECK: {checks[key]}" if key in checks else "")
+        for key, value in keys.items()
+    ]
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, str):
+        return toml_string(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_format_value, value))}]"
+    return f"{{ {', '.join(format_keys(value))} }}" if isinstance(value, Mapping) else json.dumps(value)
