@@ -8,7 +8,6 @@ import select
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,13 +19,12 @@ from guided_person import TRACKERS, GuidedPerson, PersonSource, TrackerPerson, p
 from wepose_pin.assets import asset
 from wepose_pin.body import load_model
 from wepose_pin.body.subject import load_subject
-from wepose_pin.calibration import Calibration, calibrate, load_protocol
-from wepose_pin.commands.guide import choose_parts, choose_protocol
+from wepose_pin.calibration import Calibration, calibrate
 from wepose_pin.commands.live import live
 from wepose_pin.errors import BadSession
 from wepose_pin.live import Output, Request, SensorSetup, Status, open_source
 from wepose_pin.live.assignment import read_segments, write_segments
-from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
+from wepose_pin.live.guide import Guide, GuideOptions, choose_parts, choose_protocol
 from wepose_pin.live.state import GuideView
 from wepose_pin.live.steps import make_steps
 from wepose_pin.readers import load_session
@@ -50,39 +48,32 @@ class Moment(NamedTuple):
     view: GuideView
 
 
-def make_options(
+class QuickOptions(GuideOptions):
+    """Estimates nothing on the way, and writes no page of a calibration."""
+
+    def estimate(self, recording: Recording) -> Calibration:  # noqa: ARG002
+        raise BadSession("nothing is estimated here")
+
+    def calibrate(self, path: Path, entered: Mapping[str, float]) -> Calibration:
+        return calibrate(load_session(path), measured={**self.measured, **entered})
+
+
+def make_guide(
+    source: PersonSource,
     folder: Path,
     known: Mapping[str, str] | None = None,
     mounts: Mapping[str, np.ndarray] | None = None,
-    protocol_name: str = "clasp",
+    protocol: str = "clasp",
     clasp_s: float = CLASP_S,
     given: Mapping[str, float] = MEASURED,
-) -> GuideOptions:
-    """A guide whose clasp is short, and which estimates nothing on the way."""
-    protocol, model = load_protocol(protocol_name), load_model()
-    steps = tuple(step._replace(seconds=clasp_s) if step.phase == "clasp" else step for step in protocol.steps)
-
-    def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
-        return Calibrated(calibrate(load_session(path), measured={**given, **measured}), folder)
-
-    def estimate(_: Recording) -> Calibration:
-        raise BadSession("nothing is estimated here")
-
-    return GuideOptions(
-        folder,
-        replace(protocol, steps=steps),
-        SensorSetup(remounted=True, mounts=mounts or {}),
-        model,
-        calibrate_file,
-        estimate,
-        "amekf",
-        known or {},
-        frozenset(step.phase for step in protocol.steps) - {"start", "clasp"},
-    )
-
-
-def make_guide(source: PersonSource, options: GuideOptions) -> Guide:
-    return Guide(source, options, make_steps(options.protocol))
+) -> Guide:
+    """A guide whose clasp is short."""
+    text = asset("calibration", "clasp.toml").read_text(encoding="utf-8")
+    (folder / "clasp.toml").write_text(text.replace("seconds = 60", f"seconds = {clasp_s}"), encoding="utf-8")
+    parts = protocol.replace("clasp", str(folder / "clasp.toml"))
+    setup = SensorSetup(mounts=mounts or {})
+    options = QuickOptions(folder, setup, load_model(), parts, measured=given, known=known or {})
+    return Guide(source, options, make_steps(options.joined))
 
 
 class Session:
@@ -101,7 +92,7 @@ class Session:
         self.source = PersonSource(self.person)
         # The closure does not show how a tracker on the torso is turned, and it has no accelerometer to tell.
         mounts = {"torso": perform(*PERSON).quat_LS["torso"]} if orientations == "sensor" else {}
-        self.guide = make_guide(self.source, make_options(folder, known, mounts, protocol, clasp_s, given))
+        self.guide = make_guide(self.source, folder, known or {}, mounts, protocol, clasp_s, given)
         self.clicks: list[str] = []
         self.obeys: Callable[[str, GuideView], str] = lambda _step, view: view.highlight
 
@@ -142,7 +133,7 @@ def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path
         "sensors", "assignment", "start", "clasp", "quality",
     ]  # fmt: skip
     assert session.guide.accepted is not None
-    live = session.guide.accepted.calibration
+    live = session.guide.accepted
     file = tmp_path / "calibration-1.mcap"
     again = calibrate(load_session(file), measured=MEASURED)
     assert again.subject.lengths == live.subject.lengths
@@ -173,7 +164,7 @@ def test_sensors_that_measure_orientations_are_shaken_and_calibrated_too(tmp_pat
     assert session.clicks == ["next", "next", "accept"]
     assert session.guide.segments == session.person.worn
     assert session.guide.accepted is not None
-    subject = session.guide.accepted.calibration.subject
+    subject = session.guide.accepted.subject
     for name, length in perform(*PERSON).lengths.items():
         assert abs(subject.lengths[name] - length) < 3.0 * subject.std(name), name
     recording = load_session(tmp_path / "calibration-1.mcap")

@@ -30,7 +30,6 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.tracking import TrackResult, track
-from wepose_pin.writers.live_log import LiveLog
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +78,8 @@ class Chaos(Source):
 
     def __init__(self, recording: Recording, arrivals: list[tuple[float, Samples]]) -> None:
         super().__init__(recording.sensors, recording.rate_hz)
-        self._arrivals, self._now, self._at = sorted(arrivals, key=lambda a: a[0]), float(recording.time[0]), 0
+        self._arrivals, self._at = sorted(arrivals, key=lambda a: a[0]), 0
+        self._now = self.begin = float(recording.time[0])
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         assert timeout_s > 0.0
@@ -119,14 +119,10 @@ def run(
     watcher: Watcher | None = None,
     method: str = "amekf",
 ) -> live.SessionSummary:
-    """A session from the recording's first sample on, as `run_session` runs it for a replay."""
-    setup = live.SensorSetup.from_recording(recording)
-    source = source or ReplaySource(recording, math.inf)
-    log = LiveLog(file, setup.header(source.sensors, source.orientations) | {"method": method})
+    """A session from the recording's first sample on, as `run_session` runs it, without a warm-up."""
+    setup, source = live.SensorSetup.from_recording(recording), source or ReplaySource(recording, math.inf)
     source.open()
-    outputs = [watcher] if watcher else []
-    begin = float(recording.time[0])
-    return live.LiveLoop(source, setup, method=method, log=log, begin=begin, outputs=outputs).run()
+    return live.LiveLoop(source, setup, method=method, record=file, outputs=[watcher] if watcher else []).run()
 
 
 def assert_is_tracked_so(log: LiveRecording, *results: TrackResult) -> None:
@@ -461,11 +457,8 @@ def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> 
 def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording, header_bytes: int) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
-    setup = live.SensorSetup.from_recording(recording)
-    header = setup.header(tuple(recording.sensors)) | {"method": "amekf", "long": "x" * header_bytes}
-    log = LiveLog(Path("/dev/full"), header, force=True)
+    setup = live.SensorSetup.from_recording(replace(recording, name="x" * header_bytes))
     source = ReplaySource(recording, math.inf)
-    source.open()
-    ended = live.LiveLoop(source, setup, log=log, begin=float(recording.time[0])).run()
+    ended = live.run_session(source, setup, record="/dev/full", force=True)
     assert ended.poses > 2000
     assert "the recording ended: No space left" in ended.problem

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -12,7 +13,7 @@ from cyclopts import Group, Parameter
 
 from ..assets import find_plugins, load_plugin
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadOption, one_of
+from ..errors import BadOption, ExistingOutput, one_of
 from .options import (
     MORE,
     RESEARCH,
@@ -160,13 +161,15 @@ def live(
     from ..calibration.protocols import GUIDED
     from ..compilation import announce_compilation
     from ..live import find_setup, open_source, run_session
+    from ..live.assignment import read_segments
     from ..live.encoder import RobotFigure
+    from ..live.guide import GuideOptions, choose_protocol
     from ..live.loop import warm_up
     from ..live.robot import connect_robot, read_robot
     from ..live.setup import build_subject_model, check_mounts
+    from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView
     from ..retargeting.targets import check_person_arms
-    from .guide import make_guide_folder, run_guide
 
     for option, value in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if value is not None and not guide:
@@ -182,8 +185,8 @@ def live(
         load_subject(subject).check_quality()
     replays = source.startswith("replay:")
     samples = open_source(source, speed=speed) if replays else None
-    worn = find_setup(samples, subject, session)
-    body = build_subject_model(worn, model, () if samples is None else samples.sensors)
+    worn = find_setup(samples, subject, session, model)
+    body = build_subject_model(worn, () if samples is None else samples.sensors)
     samples = samples or _open_stream(source, worn, body, setup, guide)
     if not guide:
         check_mounts(samples, worn)  # before the page opens
@@ -196,27 +199,25 @@ def live(
     try:
         with contextlib.nullcontext(until) if until is not None else stop_requests() as should_stop:
             if guide:
-                folder = make_guide_folder(out, force)
-                guided = run_guide(
-                    samples,
+                folder = _make_guide_folder(out, force)
+                options = GuideOptions(
+                    folder,
                     worn,
                     body,
-                    outputs,
-                    should_stop,
-                    folder=folder,
-                    protocol=protocol,
-                    measured=measured or {},
-                    stature=stature,
-                    sex=sex,
-                    subject=subject,
-                    setup_folder=setup,
-                    method=method,
+                    protocol or choose_protocol(samples, worn, body),
+                    method,
+                    measured or {},
+                    stature,
+                    sex,
+                    subject,
+                    {} if setup is None else read_segments(setup, tuple(body.table.segments)),
                 )
+                guided = run_guide(samples, options, outputs, should_stop)
                 if guided is None:
                     say("The guided session was ended before a calibration was accepted.")
                     return Live(None, None)
                 (samples, worn), record = guided, record or _name_recording(folder)
-                body = build_subject_model(worn, model, samples.sensors)
+                body = build_subject_model(worn, samples.sensors)
             if robot_options is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
                 driven = connect_robot(robot_options, samples.sensors, worn.subject, factor, body.table)
@@ -233,7 +234,7 @@ def live(
                 driven.open()
             summary = run_session(
                 samples,
-                worn.as_recorded(model),
+                worn,
                 method=method,
                 model=body,
                 record=record,
@@ -247,6 +248,17 @@ def live(
     ended = Live(summary, driven)
     _print_end(ended, record)
     return ended
+
+
+def _make_guide_folder(out: Path | None, force: bool) -> Path:
+    folder = out or Path(time.strftime("wepose-%Y%m%d-%H%M%S"))
+    if (folder / "subject.toml").exists() and not force:
+        raise ExistingOutput(f"{folder}: holds a subject; --force replaces it, -o names another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExistingOutput(f"{folder}: cannot be made: {error.strerror}") from error
+    return folder
 
 
 def _print_end(ended: Live, record: Path | None) -> None:

@@ -82,7 +82,7 @@ class AssignedSource(Source):
     ) -> None:
         super().__init__((segment for segment in order if segment in segments.values()), source.rate_hz)
         self.source, self.segments, self._is_open = source, dict(segments), is_open
-        self.problems = source.problems
+        self.problems, self.begin = source.problems, source.begin
 
     @property
     def orientations(self) -> dict[str, bool]:

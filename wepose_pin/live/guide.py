@@ -8,31 +8,40 @@ source's clock.
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
 from ..body.kinematics import KinematicsSolver
-from ..calibration import Calibration, Protocol
+from ..body.subject import Subject, population_subject
+from ..calibration import Calibration, Protocol, calibrate, load_protocol
+from ..calibration.protocols import BOW, GUIDED, split_protocol
 from ..errors import BadOption
+from ..filters import BEST
+from ..readers import load_session
 from ..readers.live_log import Markers, build_recording
+from ..readers.mvnx import read_subject
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
 from ..simulation import simulate
 from ..writers.live_log import LiveLog
-from .assignment import AssignedSource
+from .assignment import AssignedSource, write_segments
 from .setup import SensorSetup
 from .sources.base import Source
 from .state import Action, GuideStep, GuideView, LivePose, Output, Stage, Status, StreamInfo, join_names
 from .ticks import SensorMonitor, TickStream
 
+STATURE = "stature"  # that may be measured in place of a length
+SUBJECT_FILES = ("subject.toml", "subject.urdf", "calibration.json", "report.html")
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
 FIGURE_RATE_HZ = 30.0
 MOTION_S = 14.0  # [s] of the motion of a protocol's part; it is drawn again and again
@@ -40,27 +49,82 @@ LEAD_S = 2.0  # [s] before the phase in which the figure takes its place
 SHAKE_HZ, SHAKE_ANGLE = 2.5, 0.45  # of a shaken segment; angle in rad
 
 
-class Calibrated(NamedTuple):
-    """Outcome of the calibration of an attempt."""
-
-    calibration: Calibration
-    folder: Path  # of the subject and its report
-
-
 @dataclass(frozen=True)
 class GuideOptions:
-    """What a guided session does."""
+    """What a guided session does; fields without a comment are options of `wepose live`."""
 
     folder: Path  # where recordings, calibrations and the sensors' setup go
-    protocol: Protocol
     setup: SensorSetup  # name, start pose and body of the session; its mounts, where known
     model: BodyModel
-    calibrate: Callable[[Path, Mapping[str, float]], Calibrated]  # of a file, with lengths [m] or "stature" measured
-    estimate: Callable[[Recording], Calibration]  # of the recording so far
-    method: str  # of the filter, for the recording's header
+    protocol: str  # all but the first of joined parts may be skipped
+    method: str = BEST
+    measured: Mapping[str, float] = field(default_factory=dict)
+    stature: float | None = None
+    sex: Literal["f", "m"] | None = None
+    subject: Path | None = None
     known: Mapping[str, str] = field(default_factory=dict)  # sensor → segment, as in an earlier session
-    optional: frozenset[str] = frozenset()  # phases of the protocol that may be skipped
-    measured: frozenset[str] = frozenset()  # lengths that are given already, "stature" among them where it is
+
+    @cached_property
+    def joined(self) -> Protocol:
+        return load_protocol(self.protocol)
+
+    @property
+    def optional(self) -> set[str]:
+        """Phases of the protocol that may be skipped."""
+        later = [load_protocol(part) for part in split_protocol(self.protocol)[1:]]
+        return {step.phase for part in later for step in part.steps if step.phase != "start"}
+
+    @property
+    def stated(self) -> set[str]:
+        """Lengths that the person need not measure, `STATURE` among them where it is known."""
+        return {*self.measured, *([STATURE] if self.stature is not None or self.subject is not None else [])}
+
+    def estimate(self, recording: Recording) -> Calibration:
+        """Calibrate the recording so far."""
+        prior = self._earlier or population_subject(self.stature, self.sex, self.model)
+        parts = choose_parts(self.protocol, recording.phases)
+        return calibrate(
+            recording, measured=self.measured, prior=prior, model=self.model, protocol=parts, method=self.method
+        )
+
+    def calibrate(self, path: Path, entered: Mapping[str, float]) -> Calibration:
+        """Calibrate a recording with lengths [m] that the person `entered`, and save it to a folder beside the file."""
+        from ..report.calibration import write_calibration_page
+        from ..writers.calibration import write_calibration
+        from ..writers.provenance import collect_provenance, result_folder
+
+        lengths, recording = {**self.measured, **entered}, load_session(path)
+        parts, folder = choose_parts(self.protocol, recording.phases), path.with_suffix("")
+        calibration = calibrate(
+            recording,
+            measured={name: value for name, value in lengths.items() if name != STATURE},
+            prior=self._earlier,
+            stature=lengths.get(STATURE, self.stature),
+            sex=self.sex,
+            protocol=parts,
+            method=self.method,
+        )
+        stated = {"session": path, "protocol": parts, "measured": lengths, "prior": self.subject, "method": self.method}
+        with result_folder(folder, force=True) as partial:
+            write_calibration(partial, calibration, collect_provenance("calibrate", stated))
+        write_calibration_page(folder, calibration, recording, method=self.method)
+        return calibration
+
+    @cached_property
+    def _earlier(self) -> Subject | None:
+        return None if self.subject is None else read_subject(self.subject)
+
+
+def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str:
+    """Choose the protocol where none is named: a bow follows where else nothing shows the reference's heading."""
+    known = model.table.is_mechanism or model.table.reference in setup.mounts
+    return f"{GUIDED}+{BOW}" if source.measures_orientations and not known else GUIDED
+
+
+def choose_parts(protocol: str, phases: Collection[str]) -> str:
+    """Choose the parts of a joined protocol whose phases are there, all where none is: a part may be skipped."""
+    parts = [part for part in split_protocol(protocol) if {s.phase for s in load_protocol(part).steps} <= {*phases}]
+    return "+".join(parts) or protocol
 
 
 class Turn(NamedTuple):
@@ -99,9 +163,9 @@ class Guide(Stage):
     ) -> None:
         super().__init__(source, outputs)
         self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor(source)
-        self._figure, self._figure_due = Demonstration(options.model, options.protocol) if outputs else None, 0.0
+        self._figure, self._figure_due = Demonstration(options.model, options.joined) if outputs else None, 0.0
         self.order = tuple(options.model.table.segments)  # segments in the order of the body
-        self.needs = options.protocol.needs  # segments that must carry a sensor
+        self.needs = options.joined.needs  # segments that must carry a sensor
         self.now, self.text = 0.0, ""  # [s] on the source's clock; what the person typed for the action
         self.samples: Sequence[Samples] = ()  # that came since the step has last yielded
         self.ticks: list[Ticks] = []  # those of the attempt
@@ -109,9 +173,9 @@ class Guide(Stage):
         self.attempt: Attempt | None = None  # the recording; None before it begins
         self.attempts = 0
         self.measured: dict[str, float] = {}  # lengths [m] that the person entered
-        self.accepted: Calibrated | None = None
+        self.accepted: Calibration | None = None
         self._index, self._skipped = 0, set[str]()
-        self._postponed: list[Sequence[Samples]] = []  # that came while an attempt is evaluated
+        self._postponed: list[Samples] = []  # that came while an attempt is evaluated
         self._view: GuideView
         self._running: StepRun
         self._begin(Turn(self.steps[0].name))
@@ -130,7 +194,7 @@ class Guide(Stage):
         back = [Action(step.name, f"{step.title} again", str(k)) for k, step in enumerate(self.steps[: self._index], 1)]
         return (*self._view.actions, *back)
 
-    def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibrated | None:
+    def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibration | None:
         """Lead the person until a calibration is accepted; None: the person, the source or `should_stop` ended it."""
         try:
             self.loop(should_stop)
@@ -144,10 +208,10 @@ class Guide(Stage):
         self.now, self.samples, self.ticks = self.source.clock(), samples, []
         self.monitor.push(samples, self.source.orientations)
         if self.attempt is not None:
-            self._postponed.append(samples)
+            self._postponed += samples
             if self.step.records:
                 postponed, self._postponed = self._postponed, []
-                self.ticks = [ticks for each in postponed for ticks in self.attempt.push(each)]
+                self.ticks = self.attempt.push(postponed)
                 self.attempt.log.flush_if_due()
         self._go_on(None)
         now = time.monotonic()
@@ -202,6 +266,16 @@ class Guide(Stage):
         """The source with the sensors named by their segments."""
         return AssignedSource(self.source, self.segments, self.order, is_open=True)
 
+    def accept(self, calibration: Calibration) -> None:
+        """Save the subject of the attempt's calibration, and end."""
+        folder = self.options.folder
+        for name in SUBJECT_FILES:
+            file = self.begin_attempt().log.path.with_suffix("") / name
+            if file.is_file():
+                shutil.copyfile(file, folder / name)
+        write_segments(folder, self.segments)
+        self.accepted, self.is_over = calibration, True
+
     def close(self) -> None:
         if self.attempt is not None:
             self.attempt.log.close()
@@ -224,9 +298,10 @@ class Guide(Stage):
         status = status._replace(problems=dict(self.source.problems))
         if self.is_over:
             return status
-        view = self.view()
-        status = status._replace(state="guide", message=view.sentence, progress=view.progress)
-        return status._replace(actions=self.actions, guide=view)
+        view, actions = self.view(), self.actions
+        return status._replace(
+            state="guide", message=view.sentence, progress=view.progress, actions=actions, guide=view
+        )
 
     def describe_problems(self) -> str:
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
@@ -244,7 +319,8 @@ class Attempt:
     """
 
     def __init__(self, path: Path, source: AssignedSource, options: GuideOptions) -> None:
-        self._header = options.setup.header(source.sensors, source.orientations) | {"method": options.method}
+        setup = replace(options.setup, remounted=True)
+        self._header = setup.header(source.sensors, source.orientations) | {"method": options.method}
         self._source, self.log = source, LiveLog(path, self._header)
         self.stream = TickStream(source, log=self.log)
         self._markers, self._ticks = Markers(), list[Ticks]()
@@ -255,9 +331,9 @@ class Attempt:
         return float(self._ticks[-1].time[-1]) if self._ticks else 0.0
 
     @property
-    def segments(self) -> list[str]:
-        """The segment of each sensor, in the order of the ticks' columns."""
-        return [self._markers.segments.get(name, name) for name in self._source.sensors]
+    def segments(self) -> dict[str, str]:
+        """Sensor by the name in the file → its segment, in the order of the ticks' columns."""
+        return {name: self._markers.segments.get(name, name) for name in self._source.sensors}
 
     def push(self, samples: Sequence[Samples]) -> list[Ticks]:
         """Record samples of the source; return the ticks that they complete."""
@@ -269,18 +345,13 @@ class Attempt:
         self._markers.add(kind, values)
         self.log.event(kind, **values)
 
-    def exchange(self, moved: Mapping[str, str]) -> None:
-        """Move sensors from segment to segment."""
-        now = zip(self._source.sensors, self.segments, strict=True)
-        self.mark("assign", segments={name: moved.get(segment, segment) for name, segment in now})
-
     def measured_s(self, phase: str) -> float:
         """Duration [s] of a phase so far."""
         return sum(last - first for first, last in self._phases().get(phase, ()))
 
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
-        header = self._header | {"sensors": self.segments, "phases": self._phases()}
+        header = self._header | {"sensors": [*self.segments.values()], "phases": self._phases()}
         return check_recording(build_recording(header, self.stream.rate_hz, self._ticks, None, self.log.path))
 
     def _phases(self) -> dict[str, Any]:

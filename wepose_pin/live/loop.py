@@ -9,6 +9,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from ..body.kinematics import KinematicsSolver
 from ..body.links import compute_axis_std
 from ..body.mounts import compute_start_configuration
 from ..body.soft_tissue import SoftTissueCorrection
+from ..body.subject import parse_subject, subject_toml
 from ..body.table import check_segments
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, ExistingOutput, WeposeError
@@ -64,10 +66,9 @@ class SessionSummary(NamedTuple):
 
 
 class LiveLoop(Stage):
-    """One session, from the first sample of an open source to its end; `run` closes source and `log`.
+    """One session, from the first sample of an open source to its end; `run` closes the source and the recording.
 
-    `model` None is the body of the setup, with the subject's lengths. `begin` is the time [s] of the first tick; None:
-    when every sensor has sent a sample. Raises `WeposeError` where the method cannot run live.
+    Parameters and errors as of `run_session`.
     """
 
     def __init__(
@@ -76,14 +77,18 @@ class LiveLoop(Stage):
         setup: SensorSetup,
         *,
         method: str = BEST,
-        model: BodyModel | str | Path | None = None,
-        log: LiveLog | None = None,
+        model: BodyModel | None = None,
+        record: str | Path | None = None,
+        force: bool = False,
         outputs: Sequence[Output] = (),
-        begin: float | None = None,
     ) -> None:
         super().__init__(source, outputs)
-        self.method, self.log, self.setup = method, log, setup.as_recorded()
-        self.model = build_subject_model(setup, model, source.sensors)
+        check_mounts(source, setup)
+        subject_text = None if setup.subject is None else subject_toml(setup.subject)
+        if subject_text is not None:  # as a reader of the recording gets it, with the decimals of its text
+            setup = replace(setup, subject=parse_subject(subject_text, Path("subject.toml")))
+        self.setup = setup
+        self.model = build_subject_model(setup, source.sensors, model)
         check_segments(self.model.table, source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
             _ = self.model.reaches
@@ -91,9 +96,15 @@ class LiveLoop(Stage):
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
         self._soft_tissue = SoftTissueCorrection(self.model.table, self.model.tissue_means, tuple(source.sensors))
         self._soft_tissue.correct(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
-        self._monitor, self._stream = SensorMonitor(source), TickStream(source, begin, log)
-        self._search: StartPoseSearch | None = None  # from when the ticks begin
+        self._tracker = Tracker(setup.subject, model=self.model, options=TrackOptions(method, causal=True))
         self._estimator: SegmentEstimator | None = None  # from when the start pose is found
+        self._header = setup.header(source.sensors, source.orientations)
+        self.log: LiveLog | None = None
+        if record is not None:
+            further = {"method": method, "subject": subject_text, "versions": versions()}
+            self.log = LiveLog(Path(record), self._header | further, force)
+        self._monitor, self._stream = SensorMonitor(source), TickStream(source, self.log)
+        self._search: StartPoseSearch | None = None  # from when the ticks begin
         # Where stated phases begin (True) and end, in order of time; a phase holds its first second and its last.
         spans = [(name, first, last) for name, spans in setup.phases.items() for first, last in spans]
         edges = [(first - 1e-9, name, True) for name, first, _ in spans]
@@ -118,10 +129,8 @@ class LiveLoop(Stage):
         try:
             self.loop(should_stop)
             self._end_message = "The session has ended."
-            self.send_status()
         except WeposeError as error:
             self._end_message = f"The session has ended: {error}"
-            self.send_status()
             raise
         finally:
             gc.unfreeze()
@@ -132,20 +141,21 @@ class LiveLoop(Stage):
                 if not self._poses:
                     self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
                     self.log = None
+            if self._end_message:  # when the recording is complete
+                self.send_status()
             for output in self.outputs:
                 output.close()
-        log, sending = self.log, self._monitor.sending
+        counts = {}
+        for name, row in zip(self.source.sensors, self._read_counts().tolist(), strict=True):
+            counts[name] = dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.count_missing(name)}
         return SessionSummary(
             self._poses,
             self._last_pose - self._first_pose,
-            {
-                name: dict(zip(COUNTS, row, strict=True)) | {"lost": sending[name].missing if name in sending else 0}
-                for name, row in zip(self.source.sensors, self._read_counts().tolist(), strict=True)
-            },
+            counts,
             np.array(self._latency),
             self._diagnostics,
-            "" if log is None else log.problem,
-            None if log is None else log.path,
+            "" if self.log is None else self.log.problem,
+            None if self.log is None else self.log.path,
         )
 
     # Samples to poses ------------------------------------------------------------------------------------------------
@@ -169,8 +179,8 @@ class LiveLoop(Stage):
             start = self._search.push(ticks)
             if start is None:
                 return None
-            begin, end, row = start
-            estimator = self._estimator = self._start_tracking(self._search, begin, end)
+            *start_pose, row = start
+            estimator = self._estimator = self._start_tracking(*start_pose)
         for n in range(row, len(ticks.time)):
             while self._edges and self._edges[0][0] <= ticks.time[n]:
                 _, phase, begins = self._edges.popleft()
@@ -198,21 +208,19 @@ class LiveLoop(Stage):
             if covariance is not None:
                 self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
 
-    def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> SegmentEstimator:
+    def _start_tracking(self, begin: int, end: int) -> SegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
-        rate_hz = self._stream.rate_hz
-        header = self.setup.header(self.source.sensors, self.source.orientations)
-        recording = build_recording(header, rate_hz, search.ticks, (begin, end), last=end)
+        assert self._search is not None
+        recording = build_recording(self._header, self._stream.rate_hz, self._search.ticks, (begin, end), last=end)
         diagnostics = check_units(recording, self.source)
-        tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
-        tracker.push(recording)
-        estimator = tracker.segment_estimator
+        self._tracker.push(recording)
+        estimator = self._tracker.segment_estimator
         assert estimator is not None
-        search.ticks = []
+        self._search.ticks = []
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = self._heading_reset_time = float(recording.time[-1])
         self._log_event("start", begin=begin, end=end)
-        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
+        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, self._stream.rate_hz)
         for output in self.outputs:
             output.start(info)
         return estimator
@@ -273,27 +281,20 @@ class LiveLoop(Stage):
         frozen = np.zeros(len(sensors), dtype=bool) if clock is None else clock.frozen.copy()
         lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen
         lost |= False if clock is None else clock.lost
-        statuses = []
+        problems, statuses = dict(self.source.problems), []
         for i, name in enumerate(sensors):
-            status = known.get(name, SensorStatus(name))._replace(
-                lost=bool(lost[i]),
-                frozen=bool(frozen[i]),
-                late=int(counts[i, LATE]),
-                heading_std=float(self._heading_std[i]),
-            )
+            status = known.get(name, SensorStatus(name))._replace(lost=bool(lost[i]), frozen=bool(frozen[i]))
+            status = status._replace(late=int(counts[i, LATE]), heading_std=float(self._heading_std[i]))
             if estimator is not None:
                 bias, age_s = tuple(estimator.gyro_bias[i].tolist()), max(0.0, now - self._heading_reset_time)
                 status = status._replace(static=bool(estimator.static[i]), gyro_bias=bias, heading_age=age_s)
             statuses.append(status)
-        problems = dict(self.source.problems)
-        for name, count in zip(sensors, counts[:, CUT_OFF].tolist(), strict=True):
-            if count:
-                problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = count
+            if counts[i, CUT_OFF]:
+                problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = int(counts[i, CUT_OFF])
         recorded_s = 0.0
         if self.log is not None:
             recorded_s = 0.0 if clock is None else max(0.0, clock.newest - clock.begin)
-            if self.log.problem:
-                problems[self.log.problem] = 1
+            problems |= {self.log.problem: 1} if self.log.problem else {}
         latency = list(itertools.islice(reversed(self._latency), SHOWN_LATENCIES)) or [0.0]
         p50, p99 = (1e3 * np.quantile(latency, (0.5, 0.99))).tolist()
         description = self._describe_state(lost, frozen)
@@ -325,20 +326,17 @@ def run_session(
     setup: SensorSetup,
     *,
     method: str = BEST,
-    model: BodyModel | str | Path | None = None,
+    model: BodyModel | None = None,
     record: str | Path | None = None,
     force: bool = False,
     outputs: Sequence[Output] = (),
     until: Callable[[], bool] = lambda: False,
 ) -> SessionSummary:
-    """Open the source, track it to its end, close everything.
+    """Open the source, track it to its end or until `until` returns True, close everything.
 
-    Raises
-    ------
-    WeposeError
-        No such source; a sensor whose mount is not known; an existing file.
+    `model` None is the body of the setup, with the subject's lengths. Raises `WeposeError` where there is no such
+    source, the mount of a sensor is not known, or the file `record` is there and `force` is not given.
     """
-    setup = setup.as_recorded(model)
     if record is not None and Path(record).exists() and not force:
         raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
     check_mounts(source, setup)
@@ -347,18 +345,10 @@ def run_session(
         for output in outputs:
             output.close()
         return SessionSummary()
-    log = None
     try:
-        check_mounts(source, setup)
-        header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
-        if record is not None:
-            log = LiveLog(Path(record), header, force)
-        begin = float(source.recording.time[0]) if isinstance(source, ReplaySource) else None
-        loop = LiveLoop(source, setup, method=method, model=model, log=log, outputs=outputs, begin=begin)
+        loop = LiveLoop(source, setup, method=method, model=model, record=record, force=force, outputs=outputs)
     except BaseException:
         source.close()
-        if log is not None:
-            log.close()
         raise
     return loop.run(until)
 

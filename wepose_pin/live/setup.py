@@ -11,7 +11,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..body.body import load_sensed_model
-from ..body.subject import Subject, load_subject, parse_subject, population_subject, subject_toml
+from ..body.subject import Subject, load_subject, population_subject, subject_toml
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadSession
 from ..readers.session_file import SensorKeys, read_head, read_sensor_keys, read_session_file
@@ -26,7 +26,6 @@ class SensorSetup:
 
     name: str = "live"
     subject: Subject | None = None  # lengths and calibrated mounts; None: the population prior and stated mounts
-    subject_text: str = ""  # the ``subject.toml`` it was read from, if any
     mounts: Mapping[str, np.ndarray] = field(default_factory=dict)  # segment → stated `quat_LS` (4,) xyzw
     phases: Mapping[str, Intervals] = field(default_factory=dict)  # [s]; without `start` the loop searches it
     start_pose: str = NEUTRAL_POSE
@@ -35,27 +34,12 @@ class SensorSetup:
     model: str = ""
 
     @classmethod
-    def from_recording(
-        cls, recording: Recording, subject: Subject | None = None, subject_text: str = ""
-    ) -> SensorSetup:
+    def from_recording(cls, recording: Recording, subject: Subject | None = None) -> SensorSetup:
         mounts = {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None}
         named = {
             key: getattr(recording, key) for key in ("name", "phases", "start_pose", "remounted", "joints", "model")
         }
-        return cls(subject=subject, subject_text=subject_text, mounts=mounts, **named)
-
-    def as_recorded(self, model: object = None) -> SensorSetup:
-        """With the subject as a reader of the recording gets it: rounded to the decimals of its text.
-
-        `model` is the file or the name of a body in place of its own; anything else changes nothing.
-        """
-        setup = self
-        if isinstance(model, str | Path):
-            setup = replace(self, model=str(Path(model).absolute() if Path(model).is_file() else model))
-        if self.subject is None or self.subject_text:
-            return setup
-        text = subject_toml(self.subject)
-        return replace(setup, subject=parse_subject(text, Path("subject.toml")), subject_text=text)
+        return cls(subject=subject, mounts=mounts, **named)
 
     def header(self, sensors: Sequence[str], orientations: Mapping[str, bool] | None = None) -> dict[str, Any]:
         """Header of the recording of a live session, without the method; `orientations` as of a `Source`."""
@@ -69,21 +53,25 @@ class SensorSetup:
             "remounted": self.remounted,
             "joints": dict(self.joints),
             "model": self.model,
-            "subject": self.subject_text or None,
+            "subject": None if self.subject is None else subject_toml(self.subject),
         }
 
 
-def find_setup(source: Source | None, subject: str | Path | None, session: str | Path | None) -> SensorSetup:
-    """The sensor setup: of a replay that of its session, else as `session` states; raises `WeposeError`."""
-    loaded, text = None, ""
-    if subject is not None:
-        loaded, path = load_subject(subject), Path(subject)
-        text = (path / "subject.toml" if path.is_dir() else path).read_text(encoding="utf-8")
+def find_setup(
+    source: Source | None, subject: str | Path | None, session: str | Path | None, model: str | Path | None = None
+) -> SensorSetup:
+    """The sensor setup: of a replay that of its session, else as `session` states; with this body, if one is named.
+
+    Raises `WeposeError` where there is no such file, or it is damaged.
+    """
+    setup = SensorSetup()
     if session is not None:
-        return replace(read_setup(Path(session)), subject=loaded, subject_text=text)
-    if isinstance(source, ReplaySource):
-        return SensorSetup.from_recording(source.recording, loaded, text)
-    return SensorSetup(subject=loaded, subject_text=text)
+        setup = read_setup(Path(session))
+    elif isinstance(source, ReplaySource):
+        setup = SensorSetup.from_recording(source.recording)
+    if model is not None:
+        setup = replace(setup, model=str(Path(model).absolute() if Path(model).is_file() else model))
+    return replace(setup, subject=None if subject is None else load_subject(subject))
 
 
 def read_setup(path: Path) -> SensorSetup:
@@ -110,17 +98,14 @@ def check_mounts(source: Source, setup: SensorSetup) -> None:
         )
 
 
-def build_subject_model(
-    setup: SensorSetup, model: BodyModel | str | Path | None = None, sensors: Sequence[str] = ()
-) -> BodyModel:
+def build_subject_model(setup: SensorSetup, sensors: Sequence[str] = (), model: BodyModel | None = None) -> BodyModel:
     """Return `model`, else the body that the setup names, else the upper body, with the subject's lengths.
 
     Without a subject a chosen body has its own lengths, the upper body those of the population prior. `sensors` are
     those of the source where it knows them; without them those of the setup.
     """
-    body = chosen = model or setup.model or None
-    if not isinstance(body, BodyModel):
-        body = load_sensed_model(body, tuple(sensors) or tuple(setup.mounts), setup.name)
+    chosen = model or setup.model or None
+    body = model or load_sensed_model(setup.model or None, tuple(sensors) or tuple(setup.mounts), setup.name)
     if setup.subject is None and chosen is not None:
         return body
     return (setup.subject or population_subject(body=body)).shape(body, remounted=setup.remounted)

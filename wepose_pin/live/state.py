@@ -15,7 +15,6 @@ import numpy as np
 from ..recording.arrivals import Samples
 from .sources.base import Source
 
-LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", "stature": "body height"}
 LONGEST_TEXT = 120  # letters that a person may type
 
 

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
+from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.quality import ENOUGH_SAMPLES, format_longest
 from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
-from .assignment import ShakeDetector
-from .guide import SILENCE_S, Calibrated, Guide, Step, StepRun, Turn
-from .state import LENGTH_NAMES, Action, GuideView, LengthEstimate, join_names
+from .assignment import AssignedSource, ShakeDetector
+from .guide import SILENCE_S, STATURE, Guide, GuideOptions, Step, StepRun, Turn
+from .loop import open_and_wait, warm_up
+from .setup import SensorSetup
+from .sources.base import Source
+from .state import Action, GuideView, LengthEstimate, Output, join_names
 from .ticks import StillPose, check_units
 
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
@@ -31,7 +35,7 @@ FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
 MORE_S = 30.0  # [s] of motion that "more" adds
 MOST_ADVICE = 2  # sentences at a time
 APART_S, APART = 3.0, 0.10  # [s] newest motion, and its median gap [m] above which the closure seems open
-STATURE = "stature"  # that a person may enter in place of a length
+LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", STATURE: "body height"}
 # Codes of reasons that more motion takes away, or begin so.
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
@@ -54,7 +58,24 @@ MORE = Action("more", f"{MORE_S:.0f} s more motion", "m")
 EXCHANGE = Action("exchange", "Exchange these sensors", "x")
 MEASURE = Action("measure", "Use this length", "l")  # its entry names the length
 
-T = TypeVar("T")
+
+def run_guide(
+    source: Source, options: GuideOptions, outputs: Sequence[Output], should_stop: Callable[[], bool]
+) -> tuple[AssignedSource, SensorSetup] | None:
+    """Lead the person to an accepted calibration, and save its subject; None where it was ended before.
+
+    Returns the source and the setup to track with. The source, not open before, stays open then, the outputs always.
+    """
+    steps = make_steps(options.joined)
+    threading.Thread(target=warm_up, args=(options.method,), daemon=True).start()  # tracking begins without a wait
+    if not open_and_wait(source, outputs, should_stop):
+        return None
+    guide = Guide(source, options, steps, outputs)
+    if guide.run(should_stop) is None:
+        source.close()
+        return None
+    subject = load_subject(options.folder)
+    return guide.assign_source(), replace(options.setup, subject=subject, remounted=False, mounts={})
 
 
 def make_steps(protocol: Protocol) -> list[Step]:
@@ -131,7 +152,7 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
 
 def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
     """Wait until the person is ready, then until the start pose was held in right units; the motions begin anew."""
-    attempt, reason, protocol = guide.begin_attempt(), turn.reason, guide.options.protocol
+    attempt, reason, protocol = guide.begin_attempt(), turn.reason, guide.options.joined
     seconds, do = START_POSE_S, "Stand still in the start pose."
     for step in protocol.steps:
         if step.phase == "start":
@@ -148,7 +169,7 @@ def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
             for ticks in guide.ticks if guide.now >= begin else ():
                 pose = pose or StillPose(attempt.stream, seconds)
                 row = pose.push_ticks(ticks)
-                progress, moving = pose.held_s / seconds, [attempt.segments[k] for k in pose.moving]
+                progress, moving = pose.held_s / seconds, [[*attempt.segments.values()][k] for k in pose.moving]
                 moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
                 moved = moved if pose.state == "moved" else ""
                 if row is not None:
@@ -175,7 +196,9 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
     if turn.again:
         target_s = max(target_s, attempt.measured_s(phase) + min(MORE_S, target_s))
     begin, running, silent_since = guide.now + GET_READY_S, False, math.inf
-    estimates = estimate_gradually(guide, phase)
+    estimate: Calibration | None = None  # of the motion so far
+    future: Future[Calibration] | None = None  # the next one
+    estimated_s, optional = 0.0, guide.options.optional
     try:
         while (done_s := attempt.measured_s(phase)) < target_s:
             silent = guide.silent
@@ -185,6 +208,12 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
             if not running and guide.now >= begin:
                 attempt.mark("begin", phase=phase, time=attempt.newest)
                 running = True
+            if future is None and done_s >= max(FIRST_ESTIMATE_S, estimated_s + ESTIMATE_PERIOD_S):
+                estimated_s, future = done_s, calculate(partial(guide.options.estimate, attempt.recording()))
+            elif future is not None and future.done():
+                with suppress(WeposeError):
+                    estimate = future.result()
+                future = None
             finish = [FINISH] * (done_s > min(FINISH_AFTER_S, motion.seconds))
             view = GuideView(
                 _choose_sentence(motion, done_s),
@@ -192,10 +221,9 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
                 None if running else max(0.0, begin - guide.now),
                 max(0.0, target_s - done_s),
                 done_s / target_s,
-                actions=(*finish, RESTART, *[SKIP] * (phase in guide.options.optional)),
+                actions=(*finish, RESTART, *[SKIP] * (phase in optional)),
                 demonstration=phase,
             )
-            estimate = next(estimates)
             asked = yield view if estimate is None else _add_estimate(view, estimate, running, motion)
             if asked is FINISH:
                 return Turn()
@@ -218,34 +246,18 @@ def _choose_sentence(motion: ProtocolStep, done_s: float) -> str:
     return sentences[0] if turn == 0 else further[(turn - 1) % len(further)]
 
 
-def calculate(compute: Callable[[], T]) -> Future[T | WeposeError]:
-    """Calculate in a thread of its own, which does not hold up the end of the program; the result, or its error."""
-    future = Future[T | WeposeError]()
+def calculate(compute: Callable[[], Calibration]) -> Future[Calibration]:
+    """Calculate in a thread of its own, which does not hold up the end of the program."""
+    future = Future[Calibration]()
 
     def run() -> None:
         try:
             future.set_result(compute())
-        except WeposeError as error:
-            future.set_result(error)
         except BaseException as error:
             future.set_exception(error)
 
     threading.Thread(target=run, name="calibration", daemon=True).start()
     return future
-
-
-def estimate_gradually(guide: Guide, phase: str) -> Iterator[Calibration | None]:
-    """Calibrate the recording so far again and again; iterate over the newest result, None where there is none."""
-    attempt, newest, estimated_s = guide.begin_attempt(), None, 0.0
-    future: Future[Calibration | WeposeError] | None = None
-    while True:
-        done_s = attempt.measured_s(phase)
-        if future is not None and future.done():
-            outcome, future = future.result(), None
-            newest = outcome if isinstance(outcome, Calibration) else newest
-        elif future is None and done_s >= max(FIRST_ESTIMATE_S, estimated_s + ESTIMATE_PERIOD_S):
-            estimated_s, future = done_s, calculate(partial(guide.options.estimate, attempt.recording()))
-        yield newest
 
 
 def _add_estimate(view: GuideView, calibration: Calibration, running: bool, motion: ProtocolStep) -> GuideView:
@@ -285,40 +297,45 @@ def show_result(guide: Guide, _: Turn) -> StepRun:
             view = GuideView("The motion is being evaluated. You may move freely.", note, actions=(RESTART,))
             if (yield view) is RESTART:
                 return Turn("start")
-        result: Calibrated | WeposeError | None = future.result()
-        if entered and isinstance(result, WeposeError):  # then without it
+        calibration, reason = None, ""
+        try:
+            calibration = future.result()
+        except WeposeError as error:
+            reason = str(error)
+        if entered and reason:  # then without it
             del guide.measured[entered]
-            entered, note = "", str(result)
+            entered, note = "", reason
             continue
-        view, length = _view_result(guide, result)
-        while result is not None:
+        view, length = _view_result(guide, calibration, reason)
+        while True:
             asked = yield view._replace(note=note)
-            if asked is ACCEPT and isinstance(result, Calibrated):
-                guide.accepted, guide.is_over = result, True
+            if asked is ACCEPT and calibration is not None:
+                guide.accept(calibration)
             elif asked is MORE:
-                motions = [step for step in options.protocol.steps if step.phase != "start"]
+                motions = [step for step in options.joined.steps if step.phase != "start"]
                 return Turn(max(motions, key=lambda step: step.seconds).phase, again=True)
             elif asked is RESTART:
                 return Turn("start")
-            elif asked is EXCHANGE and isinstance(result, Calibrated):
-                moved = {label: segment for segment, label in result.calibration.exchanged.items()}
-                attempt.exchange(moved)
-                guide.segments = {sensor: moved.get(segment, segment) for sensor, segment in guide.segments.items()}
+            elif asked is EXCHANGE and calibration is not None:
+                moved = {label: segment for segment, label in calibration.exchanged.items()}
+                attempt.mark("assign", segments={name: moved.get(own, own) for name, own in attempt.segments.items()})
+                guide.segments = {name: moved.get(own, own) for name, own in guide.segments.items()}
                 return Turn("quality")
             elif asked is not None and asked.name == MEASURE.name:
                 try:
                     guide.measured[length] = 0.01 * float(guide.text.replace(",", "."))
-                    entered, note, result = length, "", None
+                    entered, note = length, ""
+                    break
                 except ValueError:
                     note = f"'{guide.text}' is no length in cm, such as 38.5."
 
 
-def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple[GuideView, str]:
+def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> tuple[GuideView, str]:
     """What to say of the result, and the length that the person may measure; empty: none."""
-    if not isinstance(result, Calibrated):
+    if calibration is None:
         sentence = "This motion cannot be evaluated."
-        return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(str(result),)), ""
-    calibration, quality = result.calibration, result.calibration.quality
+        return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(error,)), ""
+    quality = calibration.quality
     codes, lengths_given = [reason.code for reason in quality.reasons], calibration.problem.scale_lengths
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
     begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
@@ -341,7 +358,7 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple
     if any(REMEDIES.get(code) == MEASURE_IT for code in codes):
         best = calibration.problem.measured_example.partition("=")[0]
         choices = (STATURE, best) if lengths_given else (best, STATURE)
-        length = next((name for name in choices if name not in {*guide.options.measured, *guide.measured}), "")
+        length = next((name for name in choices if name not in {*guide.options.stated, *guide.measured}), "")
     if length:
         name = LENGTH_NAMES.get(length, length.replace("_", " "))
         actions.append(MEASURE._replace(entry=f"{name} [cm]"))

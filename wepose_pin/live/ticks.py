@@ -93,6 +93,10 @@ class SensorMonitor:
             else:
                 self._recent.setdefault(chunk.sensor, []).append(chunk)
 
+    def count_missing(self, sensor: str) -> int:
+        """Samples of a sensor that never came."""
+        return self.sending[sensor].missing if sensor in self.sending else 0
+
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
         """The sensors without a sample for longer than `silence_s` [s]."""
         sending = self.sending
@@ -136,14 +140,13 @@ def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
 class TickStream:
     """Makes ticks once every sensor has sent a sample and the rate is known, and records the arrivals.
 
-    `begin` is the time [s] of the first tick; None: when every sensor has sent a sample. `clock` makes the ticks; None
-    before they begin.
+    `clock` makes the ticks; None before they begin.
     """
 
-    def __init__(self, source: Source, begin: float | None = None, log: LiveLog | None = None) -> None:
+    def __init__(self, source: Source, log: LiveLog | None = None) -> None:
         self.sensors, self.orientations, self.log = tuple(source.sensors), source.orientations, log
         self.clock: StreamSynchronizer | None = None
-        self._rate_hz, self._begin = source.rate_hz, begin
+        self._rate_hz, self._begin = source.rate_hz, source.begin
         self._waiting: list[Arrivals] = []
 
     @property

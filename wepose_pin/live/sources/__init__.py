@@ -19,20 +19,11 @@ def open_source(
     segments: Sequence[str] | None = None,
     any_name: bool = False,
 ) -> Source:
-    """The source that `spec` describes, not yet opened.
+    """The source that `spec` describes, as the form of its kind says (docs/live-sources.md), not yet opened.
 
-    Parameters
-    ----------
-    spec : as the form of a kind says, such as ``replay:PATH`` (a session.toml or its folder) or ``udp:PORT``;
-        docs/live-sources.md says what each takes
-    sensors : to take; None: all that the source has
-    segments : names that sensors of a stream may have, those of the body; None: the upper body's. A replay has its own
-    speed, baud, any_name : as in `SourceOptions`
-
-    Raises
-    ------
-    BadOption
-        No such kind of source, or it names what does not exist; WeposeErrors of the recording that is replayed.
+    `segments` are names that sensors of a stream may have, None: the upper body's; the other parameters are those of
+    `SourceOptions`. Raises `BadOption` where there is no such kind of source, or what it names, and the `WeposeError`
+    of a recording that is replayed.
     """
     name, colon, rest = spec.partition(":")
     names = find_plugins("sources")

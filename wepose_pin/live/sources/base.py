@@ -67,6 +67,7 @@ class Source(ABC):
     ----------
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
+    begin : [s] time of the first sample of all; None where it is not known
     orientations : sensors whose samples are measured orientations (`pack_orientations`) → whether these are the
         segment's own, in one world; else they are the sensor's, in a world of its own
     batteries : sensor → share of its charge, 0 to 1, of those that have said it
@@ -75,6 +76,7 @@ class Source(ABC):
     """
 
     measures_orientations = False
+    begin: float | None = None
 
     def __init__(self, sensors: Iterable[str] = (), rate_hz: float | None = None) -> None:
         self.sensors, self.rate_hz = tuple(sensors), rate_hz
@@ -114,9 +116,8 @@ class Source(ABC):
     def close(self) -> None:  # noqa: B027
         """Disconnect and free what `open` took. May be called twice."""
 
-    # For sources -----------------------------------------------------------------------------------------------------
-
     def count(self, problem: str, number: int = 1) -> None:
+        """Count a problem; of very many kinds the rest is one."""
         if problem not in self.problems and len(self.problems) >= MAX_PROBLEMS:
             problem = "other problems"
         self.problems[problem] += number
@@ -133,10 +134,9 @@ class Source(ABC):
 class HostClock:
     """The offset of one sender's clock from ours, from the samples with the smallest delay.
 
-    A sample's arrival minus its time is the clocks' offset plus the sample's delay, and a delay is never negative: the
-    smallest of the last ten seconds is the best estimate of the offset (the minimum filter of NTP, RFC 5905, section
-    10, over a window that follows drift). The applied offset follows that estimate smoothly, so that regular samples
-    stay regular.
+    A sample's arrival minus its time is the clocks' offset plus its delay, and a delay is never negative: the smallest
+    of the last ten seconds is the best estimate of the offset (the minimum filter of NTP, RFC 5905, section 10). The
+    applied offset follows that estimate smoothly, so that regular samples stay regular.
     """
 
     def __init__(self) -> None:

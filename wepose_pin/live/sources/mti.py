@@ -14,6 +14,7 @@ import struct
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -42,7 +43,6 @@ Frame = tuple[int, bytes]  # MID and data
 
 
 def build_frame(mid: int, data: bytes = b"") -> bytes:
-    """The bytes of one message to a device."""
     body = bytes([0xFF, mid, len(data)]) + data
     return b"\xfa" + body + bytes([-sum(body) & 0xFF])
 
@@ -111,16 +111,17 @@ class MTiSource(Source):
         except ImportError:
             raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
         self._serial, self._devices, self._hz, self._baud = serial, dict(devices), rate_hz, baud
-        self._inbox: SimpleQueue[Samples | str] = SimpleQueue()  # samples, and problems
+        # Segment, times (m,) [s] and values (m, 6) of samples, or a problem.
+        self._inbox: SimpleQueue[tuple[str, np.ndarray, np.ndarray] | str] = SimpleQueue()
         self._waits = dict.fromkeys(devices, "the port is being opened")  # segment → why nothing comes; empty: it does
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
 
     def open(self) -> None:
         self._stop.clear()
-        for segment, path in self._devices.items():
-            self._threads.append(threading.Thread(target=self._run, args=(segment, path), daemon=True))
-            self._threads[-1].start()
+        self._threads = [threading.Thread(target=self._run, args=each, daemon=True) for each in self._devices.items()]
+        for thread in self._threads:
+            thread.start()
 
     def connect(self, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
@@ -130,16 +131,15 @@ class MTiSource(Source):
 
     def read(self, timeout_s: float) -> list[Samples]:
         samples: list[Samples] = []
-        try:
+        with suppress(Empty):
             came = self._inbox.get(timeout=timeout_s)
             while True:
                 if isinstance(came, str):
                     self.count(came)
                 else:
-                    samples += self.keep_plausible(came.sensor, came.time, np.hstack([came.gyro_S, came.accel_S]))
+                    samples += self.keep_plausible(*came)
                 came = self._inbox.get_nowait()
-        except Empty:
-            return samples
+        return samples
 
     def close(self) -> None:
         self._stop.set()
@@ -147,10 +147,11 @@ class MTiSource(Source):
             self._threads.pop().join()
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        chosen = [name for name in self.sensors if name in sensors or not sensors]
-        places = {name: f"{join_names([name])} at {self._devices[name]}" for name in chosen}
-        waits = [f"the MTi of {place}: {self._waits[name]}" for name, place in places.items() if self._waits[name]]
-        return waits[0] if waits else f"MTi sensors: {', '.join(places.values())}"
+        places = {name: f"{join_names([name])} at {self._devices[name]}" for name in sensors or self.sensors}
+        for name, place in places.items():
+            if self._waits[name]:
+                return f"the MTi of {place}: {self._waits[name]}"
+        return f"MTi sensors: {', '.join(places.values())}"
 
     # In the thread of a port -----------------------------------------------------------------------------------------
 
@@ -210,9 +211,8 @@ class MTiSource(Source):
             if skipped or len(samples) < len(frames):
                 self._inbox.put(f"damaged packets and errors of {segment}")
             if samples:
-                values = np.array([values for _, values in samples])
-                time_s = clock.to_host(np.array([seconds for seconds, _ in samples]), now)
-                self._inbox.put(Samples(segment, time_s, values[:, :3], values[:, 3:]))
+                time_s, values = map(np.array, zip(*samples, strict=True))
+                self._inbox.put((segment, clock.to_host(time_s, now), values))
             time.sleep(PAUSE_S)
 
 

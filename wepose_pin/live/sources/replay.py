@@ -40,7 +40,7 @@ class ReplaySource(Source):
 
     def __init__(self, recording: Recording, speed: float = 1.0, block: int = 64) -> None:
         super().__init__(recording.sensors, recording.rate_hz)
-        self.recording = recording
+        self.recording, self.begin = recording, float(recording.time[0])
         self._numbers = {name: list_numbers(sensor) for name, sensor in recording.sensors.items()}
         # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz

@@ -110,7 +110,7 @@ class SlimeVrSource(DatagramSource):
         for segment, own in by_segment.items():  # sent one after the other
             begin = max(self._last_times.get(segment, -math.inf), now - LONGEST_STEP_S * len(own))
             self._last_times[segment] = now
-            time_s = begin + (now - begin) * np.arange(1, len(own) + 1) / len(own)
+            time_s = np.linspace(begin, now, len(own) + 1)[1:]
             samples.append(Samples(segment, time_s, *pack_orientations(np.array(own))))
         return samples
 

@@ -11,7 +11,7 @@ import struct
 import time
 import zlib
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,9 +45,8 @@ def parse_address(text: str, option: str, example_port: int) -> tuple[str, int]:
     """Host and port of ``PORT``, of this machine, or ``HOST:PORT``; raises `BadOption` for anything else."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
-        raise BadOption(
-            f"{option} {text}: a port or HOST:PORT is needed, as {example_port} or 192.168.1.20:{example_port}"
-        )
+        examples = f"{example_port} or 192.168.1.20:{example_port}"
+        raise BadOption(f"{option} {text}: a port or HOST:PORT is needed, as {examples}")
     return host or LOOPBACK, int(port)
 
 
@@ -84,7 +83,7 @@ class DatagramSource(Source):
 
     @abstractmethod
     def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
-        """Make samples of datagrams, each with its sender's address, that came by `now` [s]; one `Samples` a sensor."""
+        """Make samples of datagrams, each with its sender's address, that came by `now` [s]."""
 
     def serve(self, now: float) -> None:
         """Do what senders want to hear from time to time; `now` [s]."""
@@ -98,10 +97,9 @@ class DatagramSource(Source):
             self._socket.bind((host, port))
         except (OSError, UnicodeError) as error:
             self.close()
-            raise BadSource(
-                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); an "
-                f"address of this machine and a port that nobody uses are needed"
-            ) from None
+            reason = getattr(error, "strerror", None) or error
+            needed = "an address of this machine and a port that nobody uses are needed"
+            raise BadSource(f"{self.kind}:{host}:{port}: cannot listen there ({reason}); {needed}") from None
         self._socket.setblocking(False)
         self.address = self._socket.getsockname()[:2]
         if self._searching:
@@ -175,10 +173,6 @@ class Batch(NamedTuple):
     battery: float = math.nan  # share of its charge, 0 to 1; NaN: not said
 
 
-class Malformed(Exception):
-    """A malformed line or datagram; its text is the problem."""
-
-
 def open_spec(rest: str, options: SourceOptions) -> UdpSource:
     """The source of ``udp:[HOST:]PORT[,gyro_unit=…][,accel_unit=…]``."""
     address, *stated = rest.split(",")
@@ -195,10 +189,9 @@ def open_spec(rest: str, options: SourceOptions) -> UdpSource:
 
 
 class UdpSource(DatagramSource):
-    """Samples of raw sensors; other parameters and errors as `DatagramSource`.
+    """Samples of raw sensors, in `units` (as of `decode`); other parameters and errors as `DatagramSource`.
 
-    Times of each sender, an address and port, are mapped to our clock (`HostClock`). `units` are ``gyro_unit`` and
-    ``accel_unit`` of what does not state its own.
+    Times of each sender, an address and port, are mapped to our clock (`HostClock`).
     """
 
     kind, sender = "udp", "samples"
@@ -227,17 +220,16 @@ class UdpSource(DatagramSource):
     def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         by_sender: dict[Any, list[Batch]] = {}  # together, since its newest sample determines its clock best
         for datagram, sender in datagrams:
-            batches, problems = decode(datagram, self.segments, self._units)
-            for batch in batches:
-                if self.tracks(batch.sensor):
+            for batch in decode(datagram, self.segments, self._units):
+                if isinstance(batch, str):
+                    self.count(batch)
+                elif not self.tracks(batch.sensor):
+                    self.count(f"samples of {batch.sensor}, which is not tracked")
+                else:
                     by_sender.setdefault(sender, []).append(batch)
                     if math.isfinite(batch.battery):
                         self._batteries[batch.sensor] = batch.battery
-                else:
-                    problems.append(f"samples of {batch.sensor}, which is not tracked")
-            for problem in problems:
-                self.count(problem)
-        by_sensor: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+        samples: list[Samples] = []
         for sender, batches in by_sender.items():
             if len(self._clocks) >= MAX_CLOCKS:
                 self._clocks.clear()
@@ -245,34 +237,27 @@ class UdpSource(DatagramSource):
             times = clock.to_host(np.concatenate([batch.time for batch in batches]), now)
             for batch in batches:
                 own, times = times[: len(batch.time)], times[len(batch.time) :]
-                by_sensor.setdefault(batch.sensor, []).append((own, batch.values))
-        samples: list[Samples] = []
-        for sensor, parts in by_sensor.items():
-            samples += self.keep_plausible(sensor, *map(np.concatenate, zip(*parts, strict=True)))
+                samples += self.keep_plausible(batch.sensor, own, batch.values)
         return samples
 
 
 def decode(
     datagram: bytes, segments: Collection[str] | None = NUMBERS, units: Mapping[str, str] = SI
-) -> tuple[list[Batch], list[str]]:
-    """The batches in a datagram, in SI, and a problem for each line that is dropped; raises nothing.
+) -> Iterator[Batch | str]:
+    """Iterate over the batches in a datagram, in SI, with a problem in place of each that is dropped; raises nothing.
 
     `segments` are names of sensors in lines of JSON; None: any. `units` are of what does not state its own.
     """
-    batches: list[Batch] = []
-    problems: list[str] = []
     is_binary = datagram[:4] == MAGIC
     for part in [datagram] if is_binary else filter(bytes.strip, datagram.splitlines()):
         try:
             batch, stated = (_decode_packet(part), units) if is_binary else _decode_line(part, segments, units)
             if not np.abs(batch.time).max() < MAX_TIME:
-                raise Malformed(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
-        except Malformed as error:
-            problems.append(str(error))
-            continue
-        factors = np.repeat([known[stated[key]] for key, known in UNITS.items()], 3)
-        batches.append(batch._replace(values=batch.values * factors))
-    return batches, problems
+                raise ValueError(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
+            factors = np.repeat([known[stated[key]] for key, known in UNITS.items()], 3)
+            yield batch._replace(values=batch.values * factors)
+        except ValueError as error:
+            yield str(error)
 
 
 def _decode_packet(datagram: bytes) -> Batch:
@@ -280,11 +265,11 @@ def _decode_packet(datagram: bytes) -> Batch:
         _, version, number, count, begin = HEADER.unpack_from(datagram)
         (checksum,) = CRC.unpack(datagram[HEADER.size + count * SAMPLE.itemsize :])
     except struct.error:
-        raise Malformed("binary packets of a wrong length") from None
+        raise ValueError("binary packets of a wrong length") from None
     if zlib.crc32(datagram[: -CRC.size]) != checksum:
-        raise Malformed("binary packets with a bad checksum")
+        raise ValueError("binary packets with a bad checksum")
     if version != VERSION or number >= len(NUMBERS) or not count:
-        raise Malformed(f"binary packets of version {version} with {count} samples of the sensor with number {number}")
+        raise ValueError(f"binary packets of version {version} with {count} samples of the sensor with number {number}")
     samples = np.frombuffer(datagram, SAMPLE, count, HEADER.size)
     return Batch(NUMBERS[number], begin + samples["after"].astype(float), samples["values"].astype(float))
 
@@ -299,15 +284,15 @@ def _decode_line(
         stated = {key: str(message.get(key, unit)) for key, unit in units.items()}
         time, gyro, accel = (_read_numbers(message[key]) for key in ("t", "gyro", "accel"))
         if not (time.size and gyro.shape == accel.shape == (*time.shape, 3)) or battery < 0.0 or battery > 1.0:
-            raise ValueError("not as it should be")
+            raise ValueError("shapes")
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        raise Malformed(f"lines that are not as {JSON_LINE}") from None
+        raise ValueError(f"lines that are not as {JSON_LINE}") from None
     is_name = isinstance(sensor, str) and 0 < len(sensor) <= MAX_NAME
     if not is_name or (segments is not None and sensor not in segments):
-        raise Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
+        raise ValueError(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
     for key, known in UNITS.items():
         if stated[key] not in known:
-            raise Malformed(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
+            raise ValueError(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
     return Batch(sensor, time.reshape(-1), np.concatenate([gyro, accel], axis=-1).reshape(-1, 6), battery), stated
 
 
