@@ -61,9 +61,9 @@ def file(name: str, read: Callable[[Path], object]) -> Callable[[Path, bytes], o
 def _datagram(_folder: Path, data: bytes) -> object:
     from wepose_pin.live.sources.udp import decode
 
-    batches, problems = decode(data)
-    assert all(problem.isprintable() for problem in problems), problems
-    return batches
+    decoded = list(decode(data))
+    assert all(each.isprintable() for each in decoded if isinstance(each, str)), decoded
+    return decoded
 
 
 KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".toml", ".mcap")
