@@ -23,13 +23,7 @@ from ..recording import Recording
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """What is chosen for a `Tracker`, beside the person and the body model; each as in `track`.
-
-    Raises
-    ------
-    BadOption
-        A method that is not known, or that needs the whole recording where `causal` is chosen.
-    """
+    """What is chosen for a `Tracker`, beside the person and the body model; each as in `track`."""
 
     method: str = BEST
     static_test: StaticTest | None = None
@@ -78,10 +72,8 @@ class SegmentOrientations:
 
 
 def compute_measured_covariance(lost_s: np.ndarray) -> np.ndarray:
-    """Compute the covariance (n, 3, 3) [rad²] of measured orientations that have been lost for `lost_s` (n,) [s].
-
-    It grows by the motion that may have been missed, as that of the filters.
-    """
+    """Compute the covariance (n, 3, 3) [rad²] of measured orientations that have been lost for `lost_s` (n,) [s]."""
+    # By the motion that may have been missed, as that of the filters.
     missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
     return (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
 
@@ -96,19 +88,20 @@ def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> n
 
 
 def compute_segment_covariance(
-    recording: Recording,
-    segment: str,
-    subject: Subject | None,
+    mounting: tuple[Recording, str, Subject | None, StartPose],
     quat_WS: np.ndarray,
     R_LS: Rotation,
     attitude_cov: np.ndarray,
-    start_pose: StartPose,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
-    `quat_WS` (n, 4) xyzw is the sensor's orientation, `attitude_cov` (n, 3, 3) [rad²] the filter's, in S, error on the
-    right.
+    Parameters
+    ----------
+    mounting : the recording, the segment, the person whose mounts are used, and the start pose
+    quat_WS, R_LS : (n, 4) xyzw of the sensor, and its mount
+    attitude_cov : (n, 3, 3) [rad²] the filter's, in S, error on the right
     """
+    recording, segment, subject, start_pose = mounting
     R = Rotation.from_quat(quat_WS).as_matrix()
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
@@ -133,7 +126,7 @@ def compute_segment_covariance(
         # The tilt of a stated mount is gravity's in the start pose, so that it has the error of the start pose.
         error_jacobian, mount_cov = R_WL, np.diag([start_var[0], start_var[1], 0.0])
     cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
-    cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_pose)
+    cov_W[:, 2, 2] += compute_start_heading_var(*mounting)
     return cov_W
 
 
@@ -156,8 +149,7 @@ def correct_covariance(
     variance : (n, 3) [rad²] as `HeadingCorrector.variance`
     lost : (n,) bool: the sensor is lost, and neighbours do not tell where its segment is
     """
-    R_VS, attitude_cov = Rotation.from_quat(filtered[0]), filtered[1]
-    vertical = np.array([0.0, 0.0, 1.0])
+    R_VS, attitude_cov, vertical = Rotation.from_quat(filtered[0]), filtered[1], np.array([0.0, 0.0, 1.0])
     with_heading_V = R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply(vertical)))  # with each axis
     alone = with_heading_V[:, 2] + start_var
     known, at_knot, correction = variance.T
@@ -178,18 +170,15 @@ def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.n
     """Compute segment → covariance (n, 3, 3) [rad²] in W by which soft tissue turns its sensor in motion."""
     covariances, elevation, relative = {}, {}, {}
     for segment, quat in quat_WL.items():
-        tissue = table.segments[segment].soft_tissue
-        along = np.array(table.segments[segment].along)
-        below = quat_WL.get(tissue.relative_to)
+        own = table.segments[segment]
+        along, below = np.array(own.along), quat_WL.get(own.soft_tissue.relative_to)
         relative[segment] = quat if below is None else rotations.multiply(rotations.conjugate(below), quat)
         turned = Rotation.from_quat(relative[segment]).as_matrix() @ along
         elevation[segment] = np.arccos(np.clip(turned @ along, -1.0, 1.0))
     for segment, quat in quat_WL.items():
-        tissue = table.segments[segment].soft_tissue
-        along = np.array(table.segments[segment].along)
+        tissue, along = table.segments[segment].soft_tissue, np.array(table.segments[segment].along)
         var = np.square(tissue.std) + np.square(np.outer(elevation[segment], tissue.per_tilt))
-        raised = [elevation[other] for other in tissue.raised if other in elevation]
-        if raised:
+        if raised := [elevation[other] for other in tissue.raised if other in elevation]:
             var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
         if tissue.per_twist and tissue.relative_to in quat_WL:
             x_y_z, w = relative[segment][:, :3], relative[segment][:, 3]

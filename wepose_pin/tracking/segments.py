@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,24 +46,15 @@ from .segment_orientations import (
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
 
-class FilterOutput(NamedTuple):
-    """What the filters of k sensors state after n samples; NaN where there is no filter, or it has no covariance."""
-
-    quat_VS: np.ndarray  # (n, k, 4) xyzw, of measured orientations too
-    attitude_cov: np.ndarray  # (n, k, 3, 3) [rad²]
-    about_vertical: np.ndarray  # (n, k, 3) as in `FilterRun`
-
-    def at(self, row: int) -> np.ndarray:
-        """What the filters know of their headings after a sample (4, k), as in `HeadingFilter`."""
-        variance = compute_heading_variance(self.quat_VS[row], self.attitude_cov[row])
-        return np.vstack([variance, self.about_vertical[row].T])
-
-
 class SegmentEstimator:
     """Orientation of each segment of a recording, chunk by chunk (`push`) or sample by sample (`step`): the same bits.
 
     The first chunk contains the phases `start` and `static`. A sensor with measured orientations has no filter; where
     it is lost its last one stands causally, else the reader has interpolated. The smoother takes the whole recording.
+
+    What the filters of the k sensors state after n samples is `quat_VS` (n, k, 4) xyzw, of measured orientations too,
+    the attitude's covariance (n, k, 3, 3) [rad²] and `about_vertical` (n, k, 3) as in `FilterRun`; NaN where there is
+    no filter, or it has no covariance.
 
     Parameters
     ----------
@@ -80,6 +70,8 @@ class SegmentEstimator:
     diagnostics : of the recording, its start pose and its mounts
     headings : what corrects the headings, causally at once; None: nothing does
     quat_WL : (k, 4) xyzw after the last sample; overwritten by the next one
+    static : (k,) bool: static by the filter's test at the last step; false of measured orientations
+    gyro_bias : (k, 3) [rad/s] after the last sample; NaN of measured orientations
     """
 
     def __init__(
@@ -111,15 +103,11 @@ class SegmentEstimator:
         """Filter and align the first chunk."""
         collect_nominal_mounts(first, self._subject, self._start_pose)  # an error before anything is filtered
         self._phases = phases = find_reference_phases(first, sways=not self._start_pose.table.is_mechanism)
-        self._filters = SensorFilters(
-            phases.noises,
-            method=self._options.method,
-            static_test=self._options.static_test,
-            start=first.span(phases.start),
-        )
+        method, test, start = self._options.method, self._options.static_test, phases.start
+        self._filters = SensorFilters(phases.noises, method=method, static_test=test, start=first.span(start))
         orientation = self._filters.push(first)
-        R_VS_start = find_start_orientations(first, orientation, phases.start)
-        mounts, offsets, diagnostics = align_sensors(first, self._subject, R_VS_start, phases.start, self._start_pose)
+        R_VS_start = find_start_orientations(first, orientation, start)
+        mounts, offsets, diagnostics = align_sensors(first, self._subject, R_VS_start, start, self._start_pose)
         self.diagnostics = tuple(drop_consequences((*phases.diagnostics, *diagnostics)))
         self.names, self.rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         k = len(self.names)
@@ -131,10 +119,7 @@ class SegmentEstimator:
         self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
         self._recent = np.empty((0, k, 4))  # orientations of the last `RESET_S`
         self._oldest = 0  # row of `_recent` with the oldest sample
-        self._filter_headings: np.ndarray  # after the last chunk
-        self._end_s: float  # [s] the same
         self.quat_WL = np.zeros((k, 4))
-        self._uncorrected = np.zeros(k)
         # [rad²] `HeadingCorrector.variance` at the last step; NaN: the heading's variance is that of its filter
         self._variance = np.full((3, k), np.nan)
         problem = None
@@ -146,25 +131,24 @@ class SegmentEstimator:
         if problem is None:
             return self._place(first, orientation)
         # Headings are observed from the first sample after the start pose on.
-        begin = int(np.searchsorted(first.time, phases.start[1], side="right"))
-        start = self._stack(first.cut(slice(0, begin)), {n: o.take(slice(0, begin)) for n, o in orientation.items()})
+        begin = int(np.searchsorted(first.time, start[1], side="right"))
+        rows = slice(0, begin)
+        before = self._stack(first.cut(rows), {name: each.take(rows) for name, each in orientation.items()})
         time = float(first.time[0]) + begin / self.rate_hz
-        self.headings = HeadingCorrector(problem, self._heading_offset.copy(), start.at(-1), time)
+        self.headings = HeadingCorrector(problem, self._heading_offset.copy(), _describe_headings(*before), time)
         if self._options.causal:
             self._variance = self.headings.variance
         return self._place(first, orientation, begin)
 
     @property
     def static(self) -> np.ndarray:
-        """(k,) bool: static by the filter's test at the last step; false of measured orientations."""
-        return self._of_all(self._filters.static, np.False_)
+        return self._extend(self._filters.static, np.False_)
 
     @property
     def gyro_bias(self) -> np.ndarray:
-        """(k, 3) [rad/s] after the last sample; NaN of measured orientations."""
-        return self._of_all(self._filters.gyro_bias, np.nan, 3)
+        return self._extend(self._filters.gyro_bias, np.nan, 3)
 
-    def _of_all(self, values: np.ndarray | None, missing: float | np.bool_, *shape: int) -> np.ndarray:
+    def _extend(self, values: np.ndarray | None, missing: float | np.bool_, *shape: int) -> np.ndarray:
         """Return values (k, *shape) of all sensors from those of the filters; `missing` where there is none."""
         all_values = np.full((len(self.names), *shape), missing)
         if values is not None:
@@ -192,45 +176,51 @@ class SegmentEstimator:
         if self.headings is not None:
             self._variance = self.headings.variance  # of this sample, as in `_place`
             if self.headings.push(row[None], accel_S[None], self._clasped):
-                self.headings.close(self._read_filters().at(0))
+                self.headings.close(_describe_headings(*self._read_filters()))
         return self.quat_WL
 
     def _fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
-        """Return what `_place_segments` fades in: from and to (k,) [rad], the next sample's number, their number."""
-        return (self._uncorrected, self._uncorrected, 0, 1) if self.headings is None else self.headings.fade
+        """Return what `_place_segments` fades in, as `HeadingCorrector.fade`."""
+        if self.headings is not None:
+            return self.headings.fade
+        nothing = np.zeros(len(self.names))
+        return nothing, nothing, 0, 1
 
-    def _read_filters(self) -> FilterOutput:
-        """Read what the filters state after the last step."""
-        filters, quat_VS = self._filters, self._recent[self._oldest - 1].copy()
-        attitude_cov = self._of_all(filters.attitude_cov, np.nan, 3, 3)
-        return FilterOutput(quat_VS[None], attitude_cov[None], self._of_all(filters.about_vertical, np.nan, 3)[None])
+    def _read_filters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Read what the filters state after the last step, of n = 1 sample."""
+        quat_VS = self._recent[self._oldest - 1].copy()
+        attitude_cov = self._extend(self._filters.attitude_cov, np.nan, 3, 3)
+        return quat_VS[None], attitude_cov[None], self._extend(self._filters.about_vertical, np.nan, 3)[None]
 
-    def _stack(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> FilterOutput:
+    def _stack(
+        self, chunk: Recording, orientation: Mapping[str, Orientation]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stack what the filters state of a chunk."""
         n, k = len(chunk), len(self.names)
-        output = FilterOutput(np.empty((n, k, 4)), np.full((n, k, 3, 3), np.nan), np.full((n, k, 3), np.nan))
+        quat_VS, attitude_cov = np.empty((n, k, 4)), np.full((n, k, 3, 3), np.nan)
+        about_vertical = np.full((n, k, 3), np.nan)
         for i, (name, sensor) in enumerate(chunk.sensors.items()):
             if isinstance(sensor, ImuSensor):
                 each = orientation[name]
-                output.quat_VS[:, i] = each.quat_VS
+                quat_VS[:, i] = each.quat_VS
                 if each.attitude_cov is not None and each.about_vertical is not None:
-                    output.attitude_cov[:, i], output.about_vertical[:, i] = each.attitude_cov, each.about_vertical
+                    attitude_cov[:, i], about_vertical[:, i] = each.attitude_cov, each.about_vertical
                 continue
-            output.quat_VS[:, i] = sensor.quat_VS
+            quat_VS[:, i] = sensor.quat_VS
             if self._options.causal and sensor.gap is not None and sensor.gap.any():
                 before = self._recent[self._oldest - 1, i] if len(self._recent) else sensor.quat_VS[0]
                 known = np.concatenate([[True], ~sensor.gap])
                 last = np.maximum.accumulate(np.where(known, np.arange(n + 1), 0))
-                output.quat_VS[:, i] = np.concatenate([before[None], sensor.quat_VS])[last][1:]
-        return output
+                quat_VS[:, i] = np.concatenate([before[None], sensor.quat_VS])[last][1:]
+        return quat_VS, attitude_cov, about_vertical
 
     def _place(self, chunk: Recording, orientation: Mapping[str, Orientation], begin: int = 0) -> SegmentOrientations:
         """Return the segment orientations of a filtered chunk, whose headings are observed from sample `begin` on."""
-        n, output = len(chunk), self._stack(chunk, orientation)
-        quat_WL, variance = np.empty(output.quat_VS.shape), np.empty((n, *self._variance.shape))
+        n, (quat_VS, attitude_cov, about_vertical) = len(chunk), self._stack(chunk, orientation)
+        quat_WL, variance = np.empty(quat_VS.shape), np.empty((n, *self._variance.shape))
         offset = np.empty((n, len(self.names)))
         size = max(1, round(RESET_S * self.rate_hz))
-        history = np.concatenate([self._order_recent(), output.quat_VS])
+        history = np.concatenate([self._order_recent(), quat_VS])
         before = len(history) - n
         accel_S = np.stack([_find_specific_force(sensor) for sensor in chunk.sensors.values()], axis=1)
         clasped = np.zeros(n, dtype=bool)
@@ -240,34 +230,53 @@ class SegmentEstimator:
         for first, last in pairwise(sorted({0, *resets, min(begin, n), n})):
             if first in resets:
                 self._reset(history[max(0, before + first - size) : before + first])
+            headings = self.headings if first >= begin else None
             while first < last:
-                stop = last
-                if self.headings is not None and first >= begin:
-                    stop = min(last, first + self.headings.remaining)
+                stop = last if headings is None else min(last, first + headings.remaining)
                 rows = slice(first, stop)
-                placed = self._quat_WV, self._fade(), output.quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
+                placed = self._quat_WV, self._fade(), quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
                 _place_segments(*placed)
                 variance[rows], offset[rows] = self._variance, self._heading_offset
-                if self.headings is not None and first >= begin:
-                    if self.headings.push(output.quat_VS[rows], accel_S[rows], clasped[rows]):
-                        self.headings.close(output.at(stop - 1), end=float(chunk.time[stop - 1]), record=True)
+                if headings is not None:
+                    if headings.push(quat_VS[rows], accel_S[rows], clasped[rows]):
+                        knot_end = _describe_headings(quat_VS[rows], attitude_cov[rows], about_vertical[rows])
+                        headings.close(knot_end, end=float(chunk.time[stop - 1]), record=True)
                     if self._options.causal:
-                        self._variance = self.headings.variance
+                        self._variance = headings.variance
                 first = stop
-        self._recent, self._oldest, self._filter_headings = history[-size:], 0, output.at(-1)
+        self._recent, self._oldest = history[-size:], 0
+        # What the filters know after the last chunk, when it ended, and whether the palms were joined.
+        self._filter_headings = _describe_headings(quat_VS, attitude_cov, about_vertical)
         self._end_s, self._clasped = float(chunk.time[-1]), bool(clasped[-1])
+        by_name, covariances = {name: quat_WL[:, i] for i, name in enumerate(self.names)}, {}
+        soft, lost_s = compute_soft_tissue_covariances(self._start_pose.table, by_name), self._count_lost(chunk)
+        for i, name in enumerate(self.names):
+            cov = self._find_covariance(
+                i, (quat_VS[:, i], attitude_cov[:, i]), lost_s[:, i], offset[:, i], variance[:, :, i]
+            )
+            if cov is not None:
+                covariances[name] = cov + soft[name]
         return SegmentOrientations(
             recording=chunk,
             options=self._options,
-            quat_WL={name: quat_WL[:, i] for i, name in enumerate(self.names)},
+            quat_WL=by_name,
             quat_LS=dict(zip(self.names, self._quat_LS, strict=True)),
             heading_offset=dict(zip(self.names, self._heading_offset.tolist(), strict=True)),
             orientation=orientation,
-            covariance_W=self._find_covariances(chunk, output, quat_WL, offset, variance),
+            covariance_W=covariances,
             start=self._phases.start,
             static_phase=self._phases.static,
             diagnostics=self.diagnostics,
         )
+
+    def _count_lost(self, chunk: Recording) -> np.ndarray:
+        """Return for how long (n, k) [s] measured orientations have been lost at each sample."""
+        samples, lost = np.arange(len(chunk)), np.zeros((len(chunk), len(self.names)), dtype=int)
+        for i, sensor in enumerate(chunk.sensors.values()):
+            if isinstance(sensor, OrientationSensor) and sensor.gap is not None:
+                lost[:, i] = samples - np.maximum.accumulate(np.where(sensor.gap, -1 - self._lost[i], samples))
+        self._lost = lost[-1]
+        return lost / self.rate_hz
 
     def smooth_headings(self) -> HeadingCorrection | None:
         """Return the correction of the headings after the last chunk; None: nothing observes them."""
@@ -296,52 +305,49 @@ class SegmentEstimator:
             self.headings.reset(self._heading_offset)
             self._variance = self.headings.variance
 
+    def _order_recent(self) -> np.ndarray:
+        return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
+
     def covariance_gradually(self) -> Iterator[np.ndarray | None]:
         """Compute the covariances (k, 3, 3) [rad²] of the segments in W after the last step; NaN where there is none.
 
         It does so in parts of less than half a millisecond; only the last one is not None. There may be steps between
         the parts: the result is that of the step before the first one.
         """
-        output, offset, variance = self._read_filters(), self._heading_offset.copy(), np.array(self._variance)
-        lost_s, covariance = self._lost / self.rate_hz, np.full((len(self.names), 3, 3), np.nan)
+        (quat_VS, attitude_cov, _), offset = self._read_filters(), self._heading_offset.copy()
+        variance, lost_s = np.array(self._variance), self._lost / self.rate_hz
+        covariance = np.full((len(self.names), 3, 3), np.nan)
         quat_WL = {name: self.quat_WL[i : i + 1].copy() for i, name in enumerate(self.names)}
         soft = compute_soft_tissue_covariances(self._start_pose.table, quat_WL)
         yield None
         for i, name in enumerate(self.names):
-            cov = self._find_covariance(i, output, lost_s[i : i + 1], offset[None, i], variance[None, :, i])
+            filtered = quat_VS[:, i], attitude_cov[:, i]
+            cov = self._find_covariance(i, filtered, lost_s[i : i + 1], offset[None, i], variance[None, :, i])
             if cov is not None:
                 covariance[i] = (cov + soft[name])[0]
             yield None
         yield covariance
 
-    def _find_covariances(
-        self, chunk: Recording, output: FilterOutput, quat_WL: np.ndarray, offset: np.ndarray, variance: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """Return segment → covariance (n, 3, 3) [rad²] in W of a chunk; none of filters without one."""
-        covariances: dict[str, np.ndarray] = {}
-        soft: dict[str, np.ndarray] = {}
-        samples = np.arange(len(chunk))
-        for i, (name, sensor) in enumerate(chunk.sensors.items()):
-            lost_s = np.zeros(len(chunk))
-            if isinstance(sensor, OrientationSensor) and sensor.gap is not None:
-                lost = samples - np.maximum.accumulate(np.where(sensor.gap, -1 - self._lost[i], samples))
-                self._lost[i], lost_s = lost[-1], lost / self.rate_hz
-            cov = self._find_covariance(i, output, lost_s, offset[:, i], variance[:, :, i])
-            if cov is not None:
-                by_name = {each: quat_WL[:, j] for j, each in enumerate(self.names)}
-                soft = soft or compute_soft_tissue_covariances(self._start_pose.table, by_name)
-                covariances[name] = cov + soft[name]
-        return covariances
-
     def _find_covariance(
-        self, i: int, output: FilterOutput, lost_s: np.ndarray, offset: np.ndarray, variance: np.ndarray
+        self,
+        i: int,
+        filtered: tuple[np.ndarray, np.ndarray],
+        lost_s: np.ndarray,
+        offset: np.ndarray,
+        variance: np.ndarray,
     ) -> np.ndarray | None:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment in W, error on the left, without soft tissue.
 
-        None: its filter has none. `lost_s` (n,) [s] is how long a measured orientation has been lost, `offset` (n,)
-        [rad] its ψ, and `variance` (n, 3) [rad²] `HeadingCorrector.variance`.
+        None: its filter has none.
+
+        Parameters
+        ----------
+        filtered : `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its attitude
+        lost_s : (n,) [s] for how long a measured orientation has been lost
+        offset : (n,) [rad] ψ
+        variance : (n, 3) [rad²] `HeadingCorrector.variance`
         """
-        name, quat_VS, attitude_cov = self.names[i], output.quat_VS[:, i], output.attitude_cov[:, i]
+        name, (quat_VS, attitude_cov) = self.names[i], filtered
         if self._measured[i]:
             attitude_cov = compute_measured_covariance(lost_s)
         if np.isnan(attitude_cov[0, 0, 0]):
@@ -350,16 +356,16 @@ class SegmentEstimator:
             return attitude_cov
         quat_WS = rotations.multiply(rotations.rotation_about(E_Z, offset), quat_VS)
         R_LS = Rotation.from_quat(self._quat_LS[i])
-        cov = compute_segment_covariance(
-            self._first, name, self._subject, quat_WS, R_LS, attitude_cov, self._start_pose
-        )
+        mounting = self._first, name, self._subject, self._start_pose
+        cov = compute_segment_covariance(mounting, quat_WS, R_LS, attitude_cov)
         if np.isnan(variance).any():
             return cov
-        start_var = compute_start_heading_var(self._first, name, self._subject, self._start_pose)
-        return correct_covariance(cov, (quat_VS, attitude_cov), offset, start_var, variance)
+        return correct_covariance(cov, (quat_VS, attitude_cov), offset, compute_start_heading_var(*mounting), variance)
 
-    def _order_recent(self) -> np.ndarray:
-        return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
+
+def _describe_headings(quat_VS: np.ndarray, attitude_cov: np.ndarray, about_vertical: np.ndarray) -> np.ndarray:
+    """Return what the filters know of their headings after the last sample (4, k), as in `HeadingFilter`."""
+    return np.vstack([compute_heading_variance(quat_VS[-1], attitude_cov[-1]), about_vertical[-1].T])
 
 
 def _find_specific_force(sensor: Sensor) -> np.ndarray:

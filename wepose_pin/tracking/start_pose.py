@@ -1,4 +1,4 @@
-"""The start pose of causal tracking: detecting its end, and cutting it out of the recording so far."""
+"""The start pose of causal tracking: detecting its end, and cutting it out of a recording."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import rotations
 from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
-from ..recording import Intervals, OrientationSensor, Recording, join_recordings
+from ..recording import Intervals, OrientationSensor, Recording
 from ..recording.arrivals import list_numbers, unpack_orientations
 
 START_POSE_HOLD_S = 3.0  # [s] of standing still for a start pose that is not stated
@@ -93,47 +93,30 @@ class StartPoseDetector:
         return rates
 
 
-class StartPoseCutter:
-    """Cuts the start pose out of a recording that comes in chunks: `phases.start`, or the first one that is found."""
+def split_start_pose(received: Recording) -> tuple[Recording, Recording] | None:
+    """Return a recording up to the end of its start pose, and what follows; None: the start pose has not ended.
 
-    def __init__(self) -> None:
-        self._received: Recording | None = None
-        self._detector: StartPoseDetector | None = None
-
-    def push(self, chunk: Recording) -> tuple[Recording, Recording] | None:
-        """Add a chunk; return the recording up to the end of the start pose, as `cut_start_pose`, and what follows.
-
-        None: the start pose has not ended.
-        """
-        received = self._received = chunk if self._received is None else join_recordings(self._received, chunk)
-        if received.phases.get("start"):
-            interval = received.phases["start"][0]
-            if received.time[-1] < interval[1] - 1e-9:
-                return None
-            last = received.span(interval).stop
-        else:
-            if self._detector is None:
-                measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
-                self._detector = StartPoseDetector(received.rate_hz, np.array(measured))
-            detector = self._detector
-            if all(
-                detector.push(gyro_S, accel_S) != "ready" for gyro_S, accel_S in zip(*stack_ticks(chunk), strict=True)
-            ):
-                return None
-            interval = float(received.time[detector.begin]), float(received.time[detector.end])
-            last = detector.end + 1
-        start = replace(cut_start_pose(received, interval), start_is_guessed=not received.phases.get("start"))
-        return start, received.cut(slice(last, len(received)))
-
-    def explain_end(self) -> str:
-        """Explain why nothing was tracked of the recording that has ended."""
-        where = "" if self._received is None else f"{self._received.where()}: "
-        if self._detector is None or self._detector.state == "ready":
-            return f"{where}phases.start ends with the recording; nothing is left to track"
-        return (
-            f"{where}no start pose of {START_POSE_HOLD_S:g} s without motion ({self._detector.held_s:.1f} s at its "
-            f"end); state the seconds of the start pose, [phases] start = [[from, to]]"
-        )
+    The first has a phase `static` too, where that ends before it does. The start pose is `phases.start`, else the first
+    one that is found.
+    """
+    is_stated = bool(received.phases.get("start"))
+    if is_stated:
+        interval = received.phases["start"][0]
+        if received.time[-1] < interval[1] - 1e-9:
+            return None
+    else:
+        measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
+        detector = StartPoseDetector(received.rate_hz, np.array(measured))
+        if all(detector.push(*tick) != "ready" for tick in zip(*stack_ticks(received), strict=True)):
+            return None
+        interval = float(received.time[detector.begin]), float(received.time[detector.end])
+    span, before = received.span(interval), dict[str, Intervals](start=(interval,))
+    begin, static = span.start, received.phases.get("static", ())
+    if static and static[0][1] <= interval[1]:
+        before["static"] = static[:1]
+        begin = min(begin, received.span(static[0]).start)
+    start = replace(received.cut(slice(begin, span.stop)), phases=before, start_is_guessed=not is_stated)
+    return start, received.cut(slice(span.stop, len(received)))
 
 
 def stack_ticks(chunk: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -141,14 +124,3 @@ def stack_ticks(chunk: Recording) -> tuple[np.ndarray, np.ndarray]:
     numbers = [list_numbers(sensor) for sensor in chunk.sensors.values()]
     gyro_S, accel_S = (np.stack(column, axis=1) for column in zip(*numbers, strict=True))
     return gyro_S, accel_S
-
-
-def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recording:
-    """Return the part of a recording with the start pose, and with a phase `static` that ends before it does."""
-    before: dict[str, Intervals] = {"start": (interval,)}
-    span, static = recording.span(interval), recording.phases.get("static", ())
-    begin = span.start
-    if static and static[0][1] <= interval[1]:
-        before["static"] = static[:1]
-        begin = min(begin, recording.span(static[0]).start)
-    return replace(recording.cut(slice(begin, span.stop)), phases=before)

@@ -19,12 +19,12 @@ from ..body.table import check_segments
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.phases import BEGINNING_S
-from ..recording import Recording
+from ..recording import Recording, join_recordings
 from .headings import HeadingCorrection
 from .result import TrackResult
 from .segment_orientations import SegmentOrientations, TrackOptions
 from .segments import SegmentEstimator
-from .start_pose import StartPoseCutter
+from .start_pose import START_POSE_HOLD_S, split_start_pose
 
 CHUNK_S = 600.0  # of `track_chunks`
 SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
@@ -63,10 +63,11 @@ class Tracker:
         self.options = options or TrackOptions()
         self._subject, self._model = subject, model
         self._fitted: tuple[Subject, BodyModel, StartPose] | None = None  # as used, from the first chunk on
-        self._start = StartPoseCutter()  # of a causal tracker
+        self._where = ""  # begins an error's text
         self.segment_estimator: SegmentEstimator | None = None
         self._kinematics: KinematicsSolver | None = None
-        self._chunks: list[Recording] = []  # that wait for the headings
+        # Chunks that wait: causally for the end of the start pose, joined; offline for the headings.
+        self._chunks: list[Recording] = []
         self._only: SegmentOrientations | None = None  # of the first chunk, while it is the only one
 
     def push(self, chunk: Recording) -> TrackResult | None:
@@ -77,29 +78,30 @@ class Tracker:
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        options, estimator = self.options, self.segment_estimator
+        options, is_first, self._where = self.options, self.segment_estimator is None, f"{chunk.where()}: "
         self._fitted = self._fitted or _fit_body(self._subject, self._model, chunk)
         if chunk.resets and (options.open_loop or not options.causal):
             chunk = replace(chunk, resets=())
-        if estimator is not None and options.method in OFFLINE:
+        if not is_first and options.method in OFFLINE:
             raise BadOption(f"method '{options.method}' takes the whole recording as one chunk")
-        if estimator is None and options.causal:
-            parts = self._start.push(chunk)
+        if is_first and options.causal:
+            self._chunks = [join_recordings(self._chunks[0], chunk) if self._chunks else chunk]
+            parts = split_start_pose(self._chunks[0])
             if parts is None:
                 return None
             start, chunk = parts
-            self.segment_estimator = self._make_estimator(observes_headings=not options.open_loop)
+            self._chunks, self.segment_estimator = [], self._make_estimator(observes_headings=not options.open_loop)
             self.segment_estimator.push(start)
-        elif estimator is None:
-            self.segment_estimator = self._make_estimator(observes_headings=not options.open_loop)
-        assert self.segment_estimator is not None
+        estimator = self.segment_estimator = self.segment_estimator or self._make_estimator(
+            observes_headings=not options.open_loop
+        )
         if not len(chunk):
             return None
-        segments, headings = self.segment_estimator.push(chunk), self.segment_estimator.headings
+        segments, headings = estimator.push(chunk), estimator.headings
         if headings is None or options.causal:
             return self._solve_pose(segments, None if headings is None else headings.collect())
         self._chunks.append(chunk)
-        self._only = segments if estimator is None else None
+        self._only = segments if is_first else None
         return None
 
     def smooth(self) -> Iterator[TrackResult]:
@@ -111,8 +113,13 @@ class Tracker:
             A causal tracker was given no start pose, or nothing after it.
         """
         if self.options.causal and self._kinematics is None:
-            raise BadPhase(self._start.explain_end())
-        if not self._chunks or self.segment_estimator is None:
+            if self._chunks and not self._chunks[0].phases.get("start"):
+                raise BadPhase(
+                    f"{self._where}no start pose of {START_POSE_HOLD_S:g} s without motion; state the seconds of the start "
+                    f"pose, [phases] start = [[from, to]]"
+                )
+            raise BadPhase(f"{self._where}phases.start ends with the recording; nothing is left to track")
+        if self.options.causal or self.segment_estimator is None:
             return
         correction, estimator = self.segment_estimator.smooth_headings(), self._make_estimator(observes_headings=False)
         for chunk in self._chunks:
