@@ -115,8 +115,8 @@ class Tracker:
         if self.options.causal and self._kinematics is None:
             if self._chunks and not self._chunks[0].phases.get("start"):
                 raise BadPhase(
-                    f"{self._where}no start pose of {START_POSE_HOLD_S:g} s without motion; state the seconds of the start "
-                    f"pose, [phases] start = [[from, to]]"
+                    f"{self._where}no start pose of {START_POSE_HOLD_S:g} s without motion; state the seconds of the "
+                    f"start pose, [phases] start = [[from, to]]"
                 )
             raise BadPhase(f"{self._where}phases.start ends with the recording; nothing is left to track")
         if self.options.causal or self.segment_estimator is None:
