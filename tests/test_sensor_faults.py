@@ -178,8 +178,8 @@ def test_a_dead_zone_is_no_fault(zone_deg_s: float, by_axis: bool, made: Simulat
     recording = gated(made.recording(), zone_deg_s, by_axis)
     assert any((np.diff(imu.gyro_S[50:450], axis=0) == 0.0).all(axis=1).mean() > 0.1 for imu in recording.imus.values())
     assert found(recording) == {}
-    # Once the accelerometer moves they are.
-    assert [fault[0] for fault in found(stopped(recording, "gyro", 9.0, value=0.0))[BROKEN]] == ["gyro"]
+    # Of a gyroscope that shows noise at rest they are.
+    assert found(stopped(made.recording(), "gyro", 9.0, value=0.0)) == {BROKEN: [("gyro", 9.0)]}
 
 
 def test_a_dead_gyroscope_of_a_torso_that_turns_with_the_arms_is_refused(tmp_path: Path) -> None:
@@ -194,8 +194,7 @@ def test_a_dead_gyroscope_of_a_torso_that_turns_with_the_arms_is_refused(tmp_pat
         load_session(path)
 
 
-@pytest.mark.parametrize("bias_deg", [0.0, 4.9, 5.1])
-@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize(("bias_deg", "moving"), [(0.0, True), (4.9, True), (5.1, True), (4.9, False), (5.1, False)])
 def test_a_coarse_sensor_may_stay_the_same(bias_deg: float, moving: bool) -> None:
     """25 Hz in steps of 10 deg/s, on a table for ten minutes or swung about two of its axes."""
     rng, step, time = np.random.default_rng(0), np.deg2rad(10.0), np.arange(15_000) / 25.0
@@ -282,7 +281,7 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: flo
         checked(np.pi / 180.0)
 
 
-@pytest.mark.parametrize("scale", [0.0, np.pi / 180.0, 0.5, 1.0])
+@pytest.mark.parametrize("scale", [np.pi / 180.0, 0.5, 1.0])
 def test_slow_tilts_that_the_gyroscope_does_not_see_are_refused(scale: float) -> None:
     """A quarter turn in six seconds and back, with forces near gravity throughout."""
     time = np.arange(6000) / RATE
@@ -294,7 +293,7 @@ def test_slow_tilts_that_the_gyroscope_does_not_see_are_refused(scale: float) ->
     if scale >= 0.5:
         assert check_signals(recording) == ()
         return
-    with pytest.raises(BadData, match=r"tilt by \d+ deg .* gyro turns by .* \"rad/s\" would fit"):
+    with pytest.raises(BadData, match='turns too little .* "rad/s" would fit'):
         check_signals(recording)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -24,7 +24,7 @@ from ..recording import (
     format_span,
 )
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
-from ..recording.faults import SensorCheck, check_sensors
+from ..recording.faults import Fault, check_sensors
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples, resample
 from ..recording.plausibility import check_signals
 from .arrays import ArrayFile, is_array_file
@@ -92,11 +92,14 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
     check_phases(str(path), time, head.phases)
     start = next(iter(head.phases.get("start", ())), None)
-    check = check_sensors(str(path), {segment: each.list_samples() for segment, each in measured.items()}, start)
+    samples = {segment: each.list_samples() for segment, each in measured.items()}
+    faults, gyro_range, frozen = check_sensors(str(path), samples, start)
     sensors: dict[str, Sensor] = {}
-    diagnostics = [*resampled, *files.diagnostics, *check.diagnostics]
+    diagnostics = [*resampled, *files.diagnostics, *frozen]
     for segment, own in measured.items():
-        sensor, marks = _bridge_gaps(own, segment, check, gaps)
+        sensor, marks = _bridge_gaps(own, faults.get(segment, []), gaps)
+        if isinstance(sensor, ImuSensor):
+            sensor = replace(sensor, gyro_range=gyro_range[segment])
         sensors[segment] = resample(sensor, own.clock.time, time) if resampled else sensor
         diagnostics += _report_bridged_gaps(segment, marks, own.clock.step)
     recording = replace(head, time=time, rate_hz=measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics))
@@ -243,7 +246,7 @@ def _open(opened: dict[Path, T], read: Callable[[Path], T], path: Path) -> T:
 # Gaps --------------------------------------------------------------------------------------------------------------
 
 
-def _bridge_gaps(measured: _Measured, segment: str, check: SensorCheck, gaps: bool) -> tuple[Sensor, np.ndarray]:
+def _bridge_gaps(measured: _Measured, faults: Sequence[Fault], gaps: bool) -> tuple[Sensor, np.ndarray]:
     """Put the rows on the clock and bridge gaps; with the marks (n,) of lost samples.
 
     Raises
@@ -251,7 +254,7 @@ def _bridge_gaps(measured: _Measured, segment: str, check: SensorCheck, gaps: bo
     BadData
         A signal has no numbers, or a gap is too long and `gaps` are not accepted.
     """
-    clock, faults = measured.clock, check.faults.get(segment, [])
+    clock = measured.clock
     frozen = np.zeros(len(clock.time), dtype=bool)
     for fault in faults:
         frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
@@ -279,7 +282,7 @@ def _bridge_gaps(measured: _Measured, segment: str, check: SensorCheck, gaps: bo
         return OrientationSensor(quat, measured.mount, gap, measured.aligned), marks_reported
     gyro_S = bridge(signals["gyro"], marks, clock, rate=True)
     accel_S = bridge(signals["accel"], marks, clock)
-    return ImuSensor(gyro_S, accel_S, measured.mount, gap, check.gyro_range[segment]), marks_reported
+    return ImuSensor(gyro_S, accel_S, measured.mount, gap), marks_reported
 
 
 def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:

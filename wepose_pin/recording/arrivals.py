@@ -16,13 +16,14 @@ from .clocks import LONGEST_GAP_S
 from .faults import (
     AT_RANGE,
     FROZEN_SAMPLES,
+    MOST_REPEATS,
+    NOISY_HZ,
     NOISY_S,
-    PLATEAU,
-    ROUNDING,
-    SAME_RANGE,
-    STEEP,
-    TURNS_BACK,
-    TURNS_BACK_HZ,
+    SATURATION,
+    count_turns,
+    is_same,
+    start_saturation,
+    watch_saturation,
 )
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
 from .sensors import ImuSensor, Sensor
@@ -35,8 +36,7 @@ REORDER_S = 0.02  # [s] a tick waits so long for a sample that a later one has o
 WAIT_S = 0.1  # [s] a tick waits so long for a silent sensor; then the sensor is lost until its next sample
 JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor continues from there
 
-# After so many samples a noisy sensor is frozen when it repeats one for this many times as long as ever before.
-LEARNED, MOST_REPEATS = 100, 4.0
+LEARNED = 100  # samples after which a noisy sensor may count as frozen
 
 MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
 COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
@@ -56,21 +56,14 @@ SENSOR = np.dtype(
         ("jump_time", float),  # [s] of the last of these
         ("newest", float),  # [s]
         ("value", float, 6),  # the newest sample
+        ("before", float, 6),  # the one before it that differs
         ("since", float),  # [s] since when it repeats
         ("repeats", float),  # how often it does
         ("most_repeats", float),  # the most before; 0: it has never changed
-        # of each signal, over the samples that do not repeat
-        ("step", float, 6),  # to the newest value
-        ("turns", float, 6),  # reversals in this second
         ("second", float),  # [s] start of this second
-        ("samples", float),  # in this second
-        ("noisy_s", np.int64),  # number of seconds in which all signals reversed as in noise
-        # of each axis of gyro
-        ("largest", float, 3),  # [rad/s] so far
-        ("digit", float, 3),  # smallest step
-        ("entry", float, 3),  # recent steps
-        ("stands", float, 3),  # samples at the same value
-        ("level", float, 3),  # [rad/s] of saturation
+        ("turns", np.int64),  # reversals of all signals in this second, without the samples that repeat
+        ("noisy_s", np.int64),  # number of seconds in which the signals reversed as in noise
+        ("saturation", SATURATION),  # of gyro
     ],
     align=True,
 )
@@ -173,7 +166,7 @@ class StreamSynchronizer:
         k = len(self.sensors)
         self._sensors, self._clock = np.zeros(k, SENSOR), np.zeros(1, CLOCK)
         self._sensors["is_orientation"] = [name in orientations for name in self.sensors]
-        self._sensors["digit"] = self._sensors["level"] = np.inf
+        self._sensors["saturation"] = start_saturation()
         self._sensors["newest"] = -np.inf
         self._clock[0] = (begin, 1.0 / rate_hz, wait_s, 0, -np.inf)
         self.counts: np.ndarray = self._sensors["counts"]
@@ -258,62 +251,30 @@ def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
 @kernel
 def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
     """Find whether a sensor is frozen at this sample, its newest, and at which rates its gyroscope saturates."""
-    t, value, same = sample[_T], sensor.value, sensor.newest > -np.inf
-    for k in range(6):
-        same = same and value[k] == sample[1 + k]
+    t, values, is_first = sample[_T], sample[1:], sensor.newest == -np.inf
     sensor.newest = t
-    if same:
+    if not is_first and is_same(sensor.value, values):
         sensor.repeats += 1.0
-        enough = sensor.repeats >= FROZEN_SAMPLES and t - sensor.since > LONGEST_GAP_S * (1.0 + 1e-6)
-        if not enough:
-            sensor.frozen = False
-        elif sensor.most_repeats > 0.0:
+        if sensor.repeats < FROZEN_SAMPLES or t - sensor.since <= LONGEST_GAP_S * (1.0 + 1e-6):
+            return
+        if sensor.most_repeats > 0.0:
             known = sensor.noisy_s >= NOISY_S and sensor.counts[TAKEN] >= LEARNED
             sensor.frozen = known and sensor.repeats > MOST_REPEATS * sensor.most_repeats
-        elif not sensor.frozen and t - sensor.since >= NOISY_S:  # it shows no noise; the others are of its kind
+        elif t - sensor.since >= NOISY_S:  # it shows no noise; the others are of its kind
             for other in range(len(sensors)):
                 sensor.frozen = sensor.frozen or sensors[other].noisy_s >= NOISY_S
         return
-    if sensor.repeats > 0.0 and not sensor.frozen:
+    if not sensor.frozen:
         sensor.most_repeats = max(sensor.most_repeats, sensor.repeats)
-    _watch_noise(sensor, sample)
+    sensor.turns += count_turns(sensor.before, sensor.value, values)
+    seconds = t - sensor.second
+    if seconds >= 1.0:
+        sensor.noisy_s += sensor.turns > NOISY_HZ * 6.0 * seconds
+        sensor.second, sensor.turns = t, 0
     sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
-    largest, level = sensor.largest, sensor.level
-    for k in range(3):  # as `faults.find_saturation`, of the samples so far
-        rate, step = abs(sample[1 + k]), abs(sample[1 + k] - value[k])
-        largest[k] = max(largest[k], rate)
-        least = max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * max(largest[0], largest[1], largest[2]))
-        if largest[k] > level[k] or least > level[k]:
-            level[k] = np.inf  # larger rates exist
-        if step > ROUNDING * largest[k]:
-            sensor.digit[k], sensor.stands[k] = min(sensor.digit[k], step), 1.0
-            sensor.entry[k] = max(step, 0.75 * sensor.entry[k])  # the last step may be cut off itself
-            continue
-        sensor.stands[k] += 1.0
-        if rate == largest[k] >= least and sensor.stands[k] >= PLATEAU and sensor.entry[k] > STEEP * sensor.digit[k]:
-            level[k] = rate
+    watch_saturation(sensor.saturation, sample[1:4], NARROWEST_GYRO_RANGE)
     for k in range(6):
-        value[k] = sample[1 + k]
-
-
-@kernel
-def _watch_noise(sensor, sample):  # type: ignore[no-untyped-def]
-    """Count the seconds in which all signals reverse as in noise, at a sample that differs from the one before."""
-    for k in range(6):
-        step = sample[1 + k] - sensor.value[k]
-        if step * sensor.step[k] < 0.0:
-            sensor.turns[k] += 1.0
-        sensor.step[k] = step
-    sensor.samples += 1.0
-    seconds = sample[_T] - sensor.second
-    if seconds < 1.0:
-        return
-    noisy = sensor.samples >= 2.0 * FROZEN_SAMPLES
-    for k in range(6):
-        noisy = noisy and sensor.turns[k] > min(TURNS_BACK * sensor.samples, TURNS_BACK_HZ * seconds)
-        sensor.turns[k] = 0.0
-    sensor.noisy_s += noisy
-    sensor.second, sensor.samples = sample[_T], 0.0
+        sensor.before[k], sensor.value[k] = sensor.value[k], values[k]
 
 
 @kernel
@@ -401,11 +362,13 @@ def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-unty
         i = _find_sample(buffer, n, t, dt)
         if i == n:
             sensor.lost = True
-        saturation = min(sensor.level[0], sensor.level[1], sensor.level[2])  # infinite: not detected
+        level = sensor.saturation.level
         if not _write_value(buffer, n, i, t, dt, sensor.is_orientation, out[s]):
             sensor.counts[MISSING] += 1
             out[s, :] = np.nan
-        elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * saturation:
+        elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * min(
+            level[0], level[1], level[2]
+        ):
             sensor.counts[CUT_OFF] += 1
             out[s, :] = np.nan
         out_lost[s] = sensor.lost
@@ -431,48 +394,32 @@ def _write_value(buffer, n, i, t, dt, is_orientation, out):  # type: ignore[no-u
     if first or step - dt > bridged:
         return False
     before, after, share = buffer[i - 1], buffer[i], (t - buffer[i - 1, _T]) / step
-    if is_orientation:
-        _interpolate_orientation(before, after, share, out)
-        return True
-    share = share if step > HOLE * dt else min(1.0, share)
+    sign = 1.0
+    if is_orientation:  # along the shorter way
+        dot = before[1] * after[1] + before[2] * after[2] + before[3] * after[3] + before[4] * after[4]
+        sign = 1.0 if dot >= 0.0 else -1.0
+    elif step <= HOLE * dt:
+        share = min(1.0, share)
     for m in range(6):
-        out[m] = before[1 + m] + share * (after[1 + m] - before[1 + m])
-    if step > HOLE * dt:
-        return True
-    # Mean rate over (t − dt, t], each sample's rate from the one before to it; mean force of the samples within, or
-    # with fewer than two samples the force at t.
-    rate_x = rate_y = rate_z = force_x = force_y = force_z = covered = 0.0
-    inside, j = 0, i
-    while j > 0 and buffer[j, _T] > t - dt:
-        width = max(0.0, min(buffer[j, _T], t) - max(buffer[j - 1, _T], t - dt))
-        covered += width
-        rate_x += width * buffer[j, 1]
-        rate_y += width * buffer[j, 2]
-        rate_z += width * buffer[j, 3]
-        if buffer[j, _T] <= t + SAME * dt:
-            inside += 1
-            force_x += buffer[j, 4]
-            force_y += buffer[j, 5]
-            force_z += buffer[j, 6]
-        j -= 1
-    if covered <= 0.0:
-        return False
-    out[0], out[1], out[2] = rate_x / covered, rate_y / covered, rate_z / covered
-    if inside >= 2:
-        out[3], out[4], out[5] = force_x / inside, force_y / inside, force_z / inside
+        out[m] = before[1 + m] + share * (sign * after[1 + m] - before[1 + m])
+    if is_orientation:
+        norm = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+        for m in range(4):
+            out[m] /= norm
+    elif step <= HOLE * dt:
+        # Mean rate over (t − dt, t], each sample's rate from the one before to it; mean force of the samples within,
+        # or with fewer than two samples the force at t.
+        for m in range(3):
+            rate, force, covered, within, j = 0.0, 0.0, 0.0, 0, i
+            while j > 0 and buffer[j, _T] > t - dt:
+                width = max(0.0, min(buffer[j, _T], t) - max(buffer[j - 1, _T], t - dt))
+                covered += width
+                rate += width * buffer[j, 1 + m]
+                if buffer[j, _T] <= t + SAME * dt:
+                    within += 1
+                    force += buffer[j, 4 + m]
+                j -= 1
+            out[m] = rate / covered
+            if within >= 2:
+                out[3 + m] = force / within
     return True
-
-
-@kernel
-def _interpolate_orientation(before, after, share, out):  # type: ignore[no-untyped-def]
-    """Write the orientation between two samples, along the shorter way, into `out` (6,)."""
-    dot, size = 0.0, 0.0
-    for m in range(4):
-        dot += before[1 + m] * after[1 + m]
-    sign = 1.0 if dot >= 0.0 else -1.0
-    for m in range(4):
-        out[m] = (1.0 - share) * before[1 + m] + share * sign * after[1 + m]
-        size += out[m] * out[m]
-    for m in range(4):
-        out[m] /= np.sqrt(size)
-    out[4] = out[5] = 0.0

@@ -1,8 +1,8 @@
 """Faults of sensors: dead, frozen or stuck at one value, saturated, or copies of one another.
 
 A repeated value alone is no fault: a coarse sensor on a table repeats for minutes, and so do data without noise. It is
-one where the signal is noisy as long as it does not repeat, where the gyroscope turns gravity and the accelerometer
-does not or the other way round, and where a gyroscope has one value all along while others measure.
+one where the signal is noisy and repeats much longer than otherwise, or all along while another signal is noisy.
+Files and live streams (`arrivals`) share what tells noise and saturation.
 """
 
 from __future__ import annotations
@@ -13,34 +13,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .. import rotations
+from ..compilation import inlined, kernel
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from .gaps import find_runs
 from .intervals import format_time
 from .limits import NARROWEST_GYRO_RANGE
 
 # Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5
 STUCK_S = 1.0  # [s] the same for rate or force alone
-# Noise reverses at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
-TURNS_BACK, TURNS_BACK_HZ, NOISY_S = 0.3, 15.0, 2  # share of the samples, [1/s], and seconds of it
-ROWS = 1 << 18  # rows in which noise is looked for
-COARSE = 1e-4  # share of runs of equal rows above twice the usual length from which the digits are coarse
-# A constant signal contradicts the other one where gravity by the gyroscope and by the accelerometer part by so much
-# [rad] in some seconds, each averaged over `MEAN_S`; no bias of a gyroscope and no sway does that.
-PARTED, PARTED_S, MEAN_S = 0.3, 2.0, 0.25
+MOST_REPEATS = 4.0  # times as long as it repeats otherwise
+# Noise reverses dozens of times a second; smooth motion hardly does.
+NOISY_HZ, NOISY_S = 10.0, 2  # [1/s] mean over the signals, and seconds of it
+ROUNDING_TURN = 1e-14  # product of two steps [SI] that are rounding
 
 # An axis is saturated where it stands at its extreme for `PLATEAU` samples in a row, or `MANY` times for at least
-# `SHORT_PLATEAU`, and comes to it or leaves it by a step of so many digits: the top of a smooth peak has smaller steps.
-# Then all these plateaus count.
+# `SHORT_PLATEAU`, and comes to it by a step of so many digits: the top of a smooth peak has smaller steps.
 PLATEAU, SHORT_PLATEAU, MANY, STEEP = 5, 3, 10, 4.0
-SAME_RANGE = 0.1  # relative difference between the ranges of a sensor's axes, which have different scales
+SAME_LEVEL = 1e-3  # relative difference between the ends of an axis's range, and SAME_RANGE of those of the axes
+SAME_RANGE = 0.1
 AT_RANGE = 0.02  # relative distance below the range at which a sample counts as saturated: resampling mixes samples
 ROUNDING = 1e-9  # steps below this share of the largest value are rounding
 
-LARGEST = 1e9  # numbers of a file are bounded by it, in any unit, so that their squares are numbers too
 BOTH, GYRO, ACCEL = "gyro and accel", "gyro", "accel"
+
+# Of each axis: newest value, largest magnitude so far, smallest step, recent steps, samples at the same value, short
+# plateaus at the extreme, and the level of saturation, infinite where none is known.
+_OF_AXES = ("value", "largest", "digit", "entry", "stands", "peaks", "level")
+SATURATION = np.dtype([(name, float, 3) for name in _OF_AXES], align=True)
 
 
 class Fault(NamedTuple):
@@ -53,23 +53,15 @@ class Fault(NamedTuple):
 
     def describe(self, since: float) -> str:
         """Describe the fault from the time [s] `since` on."""
-        value = ", ".join(f"{v:.4g}" for v in self.value[:3])
+        value = ", ".join(f"{v:.4g}" for v in self.value)
         unit = "m/s^2" if self.signals == ACCEL else "rad/s"
         stands = "stand still, gyro" if self.signals == BOTH else "stands still"
         return f"{self.signals} {stands} at {value} {unit} from {format_time(since)} to {format_time(self.last)} s"
 
 
-class SensorCheck(NamedTuple):
-    """What the samples of a recording say about its sensors."""
-
-    faults: dict[str, list[Fault]]  # sensor → faults in the order of time
-    gyro_range: dict[str, float]  # [rad/s] as `find_gyro_range`
-    diagnostics: list[Diagnostic]
-
-
 def check_sensors(
     where: str, samples: Mapping[str, tuple[np.ndarray, ...]], start: tuple[float, float] | None
-) -> SensorCheck:
+) -> tuple[dict[str, list[Fault]], dict[str, float], list[Diagnostic]]:
     """Check that the sensors measure, and find where they do not.
 
     Parameters
@@ -77,6 +69,12 @@ def check_sensors(
     where : the file, for messages
     samples : sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost
     start : [s] the stated start pose
+
+    Returns
+    -------
+    faults : sensor → its faults in the order of time
+    gyro_range : sensor → [rad/s] as `find_gyro_range`
+    diagnostics : frozen sensors
 
     Raises
     ------
@@ -112,17 +110,15 @@ def check_sensors(
         if name not in imus and len(known) >= FROZEN_SAMPLES and (known == known[0]).all():
             facts = {"variant": "orientation", "rows": len(known)}
             diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, facts=facts))
-    return SensorCheck(faults, {name: find_gyro_range(*each[1:]) for name, each in imus.items()}, diagnostics)
+    return faults, {name: find_gyro_range(*each[1:]) for name, each in imus.items()}, diagnostics
 
 
-def _take_numbers(*values: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Take the rows that are numbers, each at most `LARGEST`; without a copy where there is nothing to do."""
-    if not all(np.isfinite(each).all() for each in values):
-        good = np.all([np.isfinite(each[:, None] if each.ndim == 1 else each).all(axis=1) for each in values], axis=0)
-        values = tuple(each[good] for each in values)
-    time, *signals = values
-    most = max(max(signal.max(initial=0.0), -signal.min(initial=0.0)) for signal in signals)
-    return time, *(np.clip(signal, -LARGEST, LARGEST) if most > LARGEST else signal for signal in signals)
+def _take_numbers(time: np.ndarray, *signals: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Take the rows that are numbers; without a copy where all are."""
+    if all(np.isfinite(each).all() for each in signals):
+        return time, *signals
+    good = np.isfinite(np.hstack(signals)).all(axis=1)
+    return time[good], *(each[good] for each in signals)
 
 
 def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list[Fault]]:
@@ -137,10 +133,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     dict
         Sensor → its faults; sensors without are left out.
     """
-    faults = {}
+    faults: dict[str, list[Fault]] = {}
     for name, (time, gyro_S, accel_S) in samples.items():
-        others = [other for key, other in samples.items() if key != name]
-        found: list[Fault] = []
         covered = np.zeros(len(time), dtype=bool)
         of_gyro, of_accel = _find_repeats(gyro_S), _find_repeats(accel_S)
         for signals, columns, repeats, least_s in (
@@ -150,25 +144,27 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         ):
             begins = np.flatnonzero(np.diff(repeats, prepend=-1) > 1)
             first, last = repeats[begins] - 1, np.append(repeats[begins[1:] - 1], repeats[-1:])
-            long = (last - first + 1 >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
-            noisy = long.any() and _is_noisy(time, columns)
-            for a, b in zip(first[long].tolist(), last[long].tolist(), strict=True):
-                rows = slice(a, b + 1)
-                if covered[rows].all():
+            length = last - first + 1
+            long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
+            if not long.any():
+                continue
+            noisy = all(_is_noisy(time, values) for values in columns)
+            rare = length > MOST_REPEATS * length[~long].max(initial=1)
+            for a, b in zip(first[long & rare].tolist(), last[long & rare].tolist(), strict=True):
+                if covered[a : b + 1].all():
                     continue
-                at_rest = signals == GYRO and not gyro_S[a].any()  # a firmware with a dead zone reports zero
-                is_stuck = (noisy and not at_rest) or _contradict(time[rows], gyro_S[rows], accel_S[rows])
+                is_stuck = noisy
+                if signals == GYRO and not gyro_S[a].any():  # a firmware with a dead zone reports zero at any rest
+                    is_stuck &= np.count_nonzero(~gyro_S.any(axis=1)) < b + 1 - a + FROZEN_SAMPLES
                 if b - a == len(time) - 1:
-                    is_stuck |= signals == BOTH and any(_is_noisy(t, signal) for t, *signal in others)
-                    is_stuck |= signals == GYRO and any((gyro != gyro[0]).any() for _, gyro, _ in others)
+                    is_stuck = any(_is_noisy(each[0], values) for each in samples.values() for values in each[1:])
                 if is_stuck:
-                    covered[rows] = True
+                    covered[a : b + 1] = True
                     # At the beginning of the recording the first sample is faulty, too.
                     begin = float(time[a] if a else np.nextafter(time[a], -np.inf))
-                    value = np.concatenate([column[a] for column in columns])
-                    found.append(Fault(signals, begin, float(time[b]), tuple(value.tolist())))
-        if found:
-            faults[name] = sorted(found, key=lambda fault: fault.first)
+                    faults.setdefault(name, []).append(Fault(signals, begin, float(time[b]), tuple(columns[0][a])))
+        if name in faults:
+            faults[name].sort(key=lambda fault: fault.first)
     return faults
 
 
@@ -181,42 +177,38 @@ def _find_repeats(*signals: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _is_noisy(time: np.ndarray, signals: tuple[np.ndarray, ...] | list[np.ndarray]) -> bool:
-    """Return whether only a fault makes signals (n, 3) repeat for long: their noise is larger than their digits.
-
-    All axes reverse as in noise in some seconds, which happens with little motion, and rows repeat briefly or for long.
-    """
-    rows = np.delete(np.arange(len(time)), _find_repeats(*signals))
-    lengths = np.diff(rows, append=len(time))
-    if len(rows) < 2 * FROZEN_SAMPLES:
-        return False
-    longer = lengths > 2.0 * np.median(lengths)
-    long = longer & (time[rows + lengths - 1] - time[rows] >= (1.0 - 1e-6) * FROZEN_S)
-    if np.count_nonzero(longer) > 3 * np.count_nonzero(long) + COARSE * len(lengths):
-        return False
-    rows = rows[:ROWS]
-    values = np.hstack([signal[rows] for signal in signals])
-    steps = np.diff(values, axis=0)
-    steps[np.abs(steps) < ROUNDING * np.abs(values).max(axis=0)] = 0.0
-    turns = np.sign(steps[1:]) * np.sign(steps[:-1]) < 0.0
-    usual = max(float(np.median(np.diff(time[rows]))), 1e-9)
-    size = max(FROZEN_SAMPLES, round(1.0 / usual))
-    count = len(turns) // size
-    share = turns[: count * size].reshape(count, size, -1).mean(axis=1)
-    return bool(np.count_nonzero((share > min(TURNS_BACK, TURNS_BACK_HZ * usual)).all(axis=1)) >= NOISY_S)
+@kernel
+def _is_noisy(time, values):  # type: ignore[no-untyped-def]
+    """Return whether signals (n, 3) reverse as in noise for `NOISY_S` seconds, without the rows that repeat."""
+    older = old = 0  # the last two rows that differ
+    second, turns, noisy_s = time[0], 0, 0
+    for row in range(1, len(time)):
+        if is_same(values[old], values[row]):
+            continue
+        turns += count_turns(values[older], values[old], values[row])
+        older, old = old, row
+        if time[row] - second >= 1.0:
+            noisy_s += turns > NOISY_HZ * 3.0 * (time[row] - second)
+            second, turns = time[row], 0
+    return noisy_s >= NOISY_S
 
 
-def _contradict(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> bool:
-    """Return whether gravity by the gyroscope and by the accelerometer part as no measuring sensor's do."""
-    window = np.floor((time - time[0]) / MEAN_S).astype(int)
-    edges = np.flatnonzero(np.diff(window, prepend=-1))  # of windows that hold samples; the last one is not complete
-    if len(edges) < 3:
-        return False
-    force = rotations.unroll(gyro_S * np.diff(time, prepend=time[0])[:, None], accel_S)
-    mean = np.add.reduceat(force, edges)[:-1]
-    apart, size = min(len(mean) - 1, round(PARTED_S / MEAN_S)), np.linalg.norm(mean, axis=1)
-    along = np.sum(mean[apart:] * mean[:-apart], axis=1)
-    return bool((along < np.cos(PARTED) * size[apart:] * size[:-apart]).any())
+@inlined
+def is_same(a, b):  # type: ignore[no-untyped-def]
+    """Return whether two rows (k,) hold the same values."""
+    same = True
+    for k in range(len(a)):
+        same = same and a[k] == b[k]
+    return same
+
+
+@inlined
+def count_turns(older, old, new):  # type: ignore[no-untyped-def]
+    """Count the signals (k,) that reverse at the middle one of three rows."""
+    turns = 0
+    for k in range(len(new)):
+        turns += (new[k] - old[k]) * (old[k] - older[k]) < -ROUNDING_TURN
+    return turns
 
 
 # Saturation -----------------------------------------------------------------------------------------------------------
@@ -224,33 +216,56 @@ def _contradict(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> bo
 
 def find_gyro_range(gyro_S: np.ndarray, accel_S: np.ndarray) -> float:
     """Find the rate [rad/s] from which an axis of gyro counts as saturated, of samples (n, 3); infinite: none is."""
-    if not find_saturation(gyro_S, NARROWEST_GYRO_RANGE).any():
-        return np.inf
-    gyro_S = np.delete(gyro_S, _find_repeats(gyro_S, accel_S), axis=0)
-    levels = np.abs(gyro_S[find_saturation(gyro_S, NARROWEST_GYRO_RANGE)])
-    return float((1.0 - AT_RANGE) * levels.min(initial=np.inf))
+    levels = _find_levels(gyro_S, NARROWEST_GYRO_RANGE)
+    if np.isfinite(levels).any():  # a frozen sensor stands, too
+        levels = _find_levels(np.delete(gyro_S, _find_repeats(gyro_S, accel_S), axis=0), NARROWEST_GYRO_RANGE)
+    return float((1.0 - AT_RANGE) * levels.min())
 
 
 def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
     """Find the samples (n, 3) at which an axis of `values` (n, 3) is saturated at its extreme, `least` or more."""
-    saturated = np.zeros(values.shape, dtype=bool)
-    largest = max(values.max(initial=0.0), -values.min(initial=0.0))
-    if largest < least:
-        return saturated
+    return np.asarray(np.abs(values) >= (1.0 - SAME_LEVEL) * _find_levels(values, least))
+
+
+def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
+    """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
+    state = start_saturation()
+    if max(values.max(initial=0.0), -values.min(initial=0.0)) >= least:
+        _watch_all(state, np.ascontiguousarray(values), least)
+    return np.asarray(state["level"][0])
+
+
+def start_saturation() -> np.ndarray:
+    """Return the record (1,) with which `watch_saturation` begins."""
+    state = np.zeros(1, SATURATION)
+    state["digit"] = state["level"] = np.inf
+    return state
+
+
+@kernel
+def _watch_all(states, values, least):  # type: ignore[no-untyped-def]
+    for row in range(len(values)):
+        watch_saturation(states[0], values[row], least)
+
+
+@inlined
+def watch_saturation(state, sample, least):  # type: ignore[no-untyped-def]
+    """Find the level of each axis, from `least` on, by the samples (3,) so far."""
+    largest = max(abs(sample[0]), abs(sample[1]), abs(sample[2]), state.largest[0], state.largest[1], state.largest[2])
     least = max(least, (1.0 - SAME_RANGE) * largest)
-    for axis, x in enumerate(np.ascontiguousarray(values.T)):  # of one piece: ten times faster
-        for extreme in (float(x.max()), float(x.min())):
-            if abs(extreme) < least:
-                continue
-            same = ROUNDING * abs(extreme)
-            at = np.abs(x - extreme) <= same
-            if np.count_nonzero(at) < PLATEAU:
-                continue
-            plateaus = [(a, b) for a, b in find_runs(at) if SHORT_PLATEAU <= b - a < len(x)]
-            steps = np.abs(np.diff(x))
-            digit = steps[steps > same].min(initial=np.inf)
-            steep = [b - a for a, b in plateaus if steps[max(a - 1, 0) : b].max() > STEEP * digit]
-            if len(steep) >= MANY or max(steep, default=0) >= PLATEAU:
-                for a, b in plateaus:
-                    saturated[a:b, axis] = True
-    return saturated
+    for k in range(3):
+        size, step = abs(sample[k]), abs(sample[k] - state.value[k])
+        state.value[k] = sample[k]
+        if size > (1.0 + SAME_LEVEL) * state.largest[k] or state.level[k] < least:  # larger values exist
+            state.level[k], state.peaks[k] = np.inf, 0.0
+        state.largest[k] = max(state.largest[k], size)
+        if step > ROUNDING * largest:
+            state.digit[k], state.stands[k] = min(state.digit[k], step), 1.0
+            state.entry[k] = max(step, 0.75 * state.entry[k])  # the last step may be cut off itself
+            continue
+        state.stands[k] += 1.0
+        at_end = size >= least and size >= (1.0 - SAME_LEVEL) * state.largest[k]
+        if at_end and state.entry[k] > STEEP * state.digit[k]:
+            state.peaks[k] += state.stands[k] == SHORT_PLATEAU
+            if state.stands[k] >= PLATEAU or state.peaks[k] >= MANY:
+                state.level[k] = state.largest[k]

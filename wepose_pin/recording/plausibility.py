@@ -25,19 +25,15 @@ from .limits import (
 from .recording import Recording
 from .sensors import ImuSensor
 
-WINDOW_S = 3.0  # [s] over which specific force averages to gravity
-FEWEST_WINDOWS, WINDOWS = 3, 40  # number of windows, those with most motion
-# Coherence measures how near the mean of rotated specific force is to gravity. Rates in deg/s that are taken for rad/s
-# lower it below `TUMBLES` of that of rates smaller by a factor 57.3, and rates in rad/s that are taken for deg/s below
-# `STIFF` of that of larger ones, where these are `COHERENT`. Of 41 real sensors none is below 0.99.
+WINDOW_S, SHORTEST_WINDOW_S = 6.0, 3.0  # [s] over which specific force averages to gravity, half of a short recording
+FEWEST_WINDOWS, WINDOWS = 2, 20  # number of windows, those with most motion
+# Coherence is the length of the mean of rotated specific force as a share of gravity. Rates in deg/s that are taken for
+# rad/s lower it below `TUMBLES` of that of rates smaller by a factor 57.3, and rates in rad/s that are taken for deg/s
+# below `STIFF` of that of larger ones, where these are `COHERENT`. Of 41 real sensors none is below 0.99.
 TUMBLES, STIFF, COHERENT = 0.7, 0.95, 0.8
-# In some seconds with hardly any tilt by accel, rates in deg/s that are taken for rad/s turn gravity by more than
-# `TURNED` in both halves; both directions are averaged over `STEADY_MEAN_S`. In four seconds that is 6 deg/s, the
-# fastest sway of a start pose.
-TURNED, STEADY, STEADY_MEAN_S = np.deg2rad(10.0), np.deg2rad(5.0), 0.25  # [rad], [rad], [s]
-# Tilt by accel [rad] between two windows that the gyroscope must measure; the largest share of it in the gyroscope's
-# rotation where the unit is too small; and the relative difference of accel's mean from gravity in a steady window.
-TILTED, UNSEEN, STEADY_NORM = np.deg2rad(20.0), 0.25, 0.1
+# Over some seconds in which accel alone is `STEADY`, rates in the right unit do not lower coherence below `UNTURNED` of
+# it: in four seconds 6 deg/s do, as does the sway of a start pose in deg/s that is taken for rad/s.
+STEADY, UNTURNED = 0.99, 0.995
 
 
 def check_signals(recording: Recording) -> tuple[Diagnostic, ...]:
@@ -53,15 +49,10 @@ def check_signals(recording: Recording) -> tuple[Diagnostic, ...]:
         place = f"{recording.where()}: sensors.{segment}"
         diagnostics += _check_gravity(recording, segment, sensor, place)
         _check_gyro_unit(sensor, recording.rate_hz, place)
+        cut = np.abs(sensor.gyro_S) >= sensor.gyro_range, find_saturation(sensor.accel_S, NARROWEST_ACCEL_RANGE)
         for name, values, most, unit, saturated in (
-            ("gyro", sensor.gyro_S, HIGHEST_RATE, "rad/s", np.abs(sensor.gyro_S) >= sensor.gyro_range),
-            (
-                "accel",
-                sensor.accel_S,
-                HIGHEST_ACCEL,
-                "m/s^2",
-                find_saturation(sensor.accel_S, NARROWEST_ACCEL_RANGE),
-            ),
+            ("gyro", sensor.gyro_S, HIGHEST_RATE, "rad/s", cut[0]),
+            ("accel", sensor.accel_S, HIGHEST_ACCEL, "m/s^2", cut[1]),
         ):
             k, axis = np.unravel_index(int(np.argmax(np.abs(values))), values.shape)
             if abs(values[k, axis]) > most:
@@ -115,21 +106,21 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
 
 def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     """Raise `WrongUnit` where gravity shows that the rates are in another unit."""
-    size = round(WINDOW_S * rate_hz)
+    size = min(round(WINDOW_S * rate_hz), len(sensor.gyro_S) // FEWEST_WINDOWS)
+    if size < SHORTEST_WINDOW_S * rate_hz:
+        return
     count = len(sensor.gyro_S) // size
     gyro, accel = (values[: count * size].reshape(count, size, 3) for values in (sensor.gyro_S, sensor.accel_S))
-    speed = np.linalg.norm(gyro, axis=2).mean(axis=1)
+    motion = np.linalg.norm(gyro, axis=2).mean(axis=1) + np.linalg.norm(accel.std(axis=1), axis=1) / STANDARD_GRAVITY
     if sensor.gap is not None:  # without bridged samples
-        speed[sensor.gap[: count * size].reshape(count, size).any(axis=1)] = -1.0
-    moving = np.argsort(-speed, kind="stable")[: min(WINDOWS, np.count_nonzero(speed >= 0.0))]
+        motion[sensor.gap[: count * size].reshape(count, size).any(axis=1)] = -1.0
+    moving = np.argsort(-motion, kind="stable")[: min(WINDOWS, np.count_nonzero(motion >= 0.0))]
     if len(moving) < FEWEST_WINDOWS:
         return
-    _check_tilts(accel.mean(axis=1), speed * WINDOW_S, place)
 
     def average_coherence(scale: float) -> float:
         """0 to 1; the specific force of a swinging arm is several times gravity, its mean in the world is gravity."""
-        forces = unroll(scale / rate_hz * gyro[moving].reshape(-1, 3), accel[moving].reshape(-1, 3))
-        means = np.linalg.norm(forces.reshape(-1, size, 3).mean(axis=1), axis=1)
+        means = _average_force(scale / rate_hz * gyro[moving], accel[moving])
         return float(np.mean(np.maximum(0.0, 1.0 - np.abs(means / STANDARD_GRAVITY - 1.0))))
 
     stated = average_coherence(1.0)
@@ -146,48 +137,21 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
         raise WrongUnit(text, "gyro_unit", "rad/s", hint)
 
 
-def _check_tilts(means: np.ndarray, paths: np.ndarray, place: str) -> None:
-    """Raise `WrongUnit` where accel tilts from window to window and gyro does not turn.
-
-    `means` (n, 3) [m/s²] of accel; `paths` (n,) [rad] of gyro, negative in a window with a gap.
-    """
-    norms = np.linalg.norm(means, axis=1)
-    steady = (np.abs(norms / STANDARD_GRAVITY - 1.0) < STEADY_NORM) & (paths >= 0.0)
-    cosines = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(norms[1:] * norms[:-1], 1e-9)
-    tilts = np.where(steady[1:] & steady[:-1], np.arccos(np.clip(cosines, -1.0, 1.0)), 0.0)
-    turns = paths[1:] + paths[:-1]
-    unseen = np.where((tilts > TILTED) & (turns < UNSEEN * tilts), tilts, 0.0)
-    if not unseen.any():
-        return
-    k = int(np.argmax(unseen))
-    raise WrongUnit(
-        f"{place}.gyro: accel shows a tilt by {np.degrees(tilts[k]):.0f} deg between {k * WINDOW_S:g} and "
-        f"{(k + 2) * WINDOW_S:g} s from the beginning, gyro turns by {np.degrees(turns[k]):.2g} deg",
-        "gyro_unit",
-        "rad/s",
-        ", or the gyroscope does not measure",
-    )
-
-
 def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
     """Find the largest rate [rad/s] of a sensor whose gyroscope turns gravity and whose accelerometer does not.
 
     NaN: they agree. The samples (n, 3) are some seconds without gaps; the unit of `accel_S` does not matter.
     """
-    up = accel_S.mean(axis=0)
-    if not np.linalg.norm(up) > 0.0 or _tilt_most(accel_S, rate_hz) > STEADY:
-        return np.nan
-    ups = unroll(gyro_S / rate_hz, np.tile(up, (len(gyro_S), 1)))
-    turned = min(_tilt_most(half, rate_hz) for half in np.array_split(ups, 2))  # in both: a lost sample is no unit
-    return float(np.linalg.norm(gyro_S, axis=1).max()) if turned > TURNED else np.nan
+    turns, force = gyro_S[None] / rate_hz, float(np.linalg.norm(accel_S, axis=1).mean())
+    steady, turned = (_average_force(scale * turns, accel_S[None])[0] for scale in (0.0, 1.0))
+    is_unseen = steady > STEADY * force and turned < UNTURNED * steady
+    return float(np.linalg.norm(gyro_S, axis=1).max()) if is_unseen else np.nan
 
 
-def _tilt_most(vectors: np.ndarray, rate_hz: float) -> float:
-    """Return the largest angle [rad] between means of vectors (n, 3) over `STEADY_MEAN_S` and the first of these."""
-    size = max(1, round(rate_hz * STEADY_MEAN_S))
-    count = len(vectors) // size
-    means = vectors[: count * size].reshape(count, size, 3).mean(axis=1)
-    lengths = np.linalg.norm(means, axis=1)
-    if count < 2 or not lengths.min() > 0.0:
-        return 0.0
-    return float(np.arccos(np.clip(means @ means[0] / (lengths * lengths[0]), -1.0, 1.0)).max())
+def _average_force(turns: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+    """Return the length (k,) [m/s²] of the mean specific force over each of k windows, in a frame that does not turn.
+
+    `turns` (k, n, 3) [rad] of each sample, `accel_S` (k, n, 3) [m/s²].
+    """
+    forces = unroll(turns.reshape(-1, 3), accel_S.reshape(-1, 3)).reshape(accel_S.shape)
+    return np.asarray(np.linalg.norm(forces.mean(axis=1), axis=1))
