@@ -293,7 +293,7 @@ def test_slow_tilts_that_the_gyroscope_does_not_see_are_refused(scale: float) ->
     if scale >= 0.5:
         assert check_signals(recording) == ()
         return
-    with pytest.raises(BadData, match='turns too little .* "rad/s" would fit'):
+    with pytest.raises(BadData, match=r'turns too little .* "rad/s" would fit'):
         check_signals(recording)
 
 
