@@ -327,7 +327,7 @@ def test_a_recording_of_arrays_is_that_of_the_session(simulated: Simulation) -> 
     quat = np.tile([0.0, 0.0, 0.0, 1.0], (900, 1))
     assert isinstance(wp.Recording.from_arrays(50.0, torso=quat).sensors["torso"], wp.OrientationSensor)
     for wrong, said in (
-        ({"rate_hz": 0.0, "torso": quat}, "rate_hz = 0.0: a finite number above 0 is needed"),
+        ({"rate_hz": 0.0, "torso": quat}, "rate_hz = 0.0; a finite number above 0 is needed"),
         ({"rate_hz": 50.0}, "no sensors"),
         ({"rate_hz": 50.0, "torso": (quat,)}, "torso: gyro_S and accel_S, "),
         ({"rate_hz": 50.0, "torso": quat, "mounts": {"torso": ("z", "+x")}}, "mounts: torso.up = 'z' is not known"),

@@ -173,7 +173,7 @@ mount = { up = "+z", forward = "+x" }
     [
         ("elbow_joint", "elbow_jiont", BadSession, r"joints\.elbow_jiont is no joint .*did you mean 'elbow_joint'"),
         ("= 0.5", "= 7.0", BadSession, r"joints\.elbow_joint = 7 is outside its limits, -6\.3 to 6\.3"),
-        ("= 0.5", '= "up"', BadSession, r"joints\.elbow_joint = 'up' is not a number"),
+        ("= 0.5", '= "up"', BadSession, r"joints\.elbow_joint = 'up'; a finite number is needed"),
         ("forearm_link", "forearm", BadSession, r"sensors\.forearm is no link of arm; did you mean 'forearm_link'"),
         ('"configuration"', '"n_pose"', BadSession, "joints needs start_pose"),
     ],

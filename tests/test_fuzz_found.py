@@ -120,8 +120,8 @@ REFUSED: list[tuple[str, Callable[[], bytes], str]] = [
     ("subject", lambda: change("subject", "qw = 1.0", f"qw = {MANY}"), "mounts.torso.qw = 9999"),
     ("subject", lambda: change("subject", "qw = 1.0", "qw = 1e200"), "mounts.torso.qw = 1e+200"),
     ("subject", lambda: change("subject", "y = 1.0\n", "y = 1e200\n"), "hinges.left_elbow.y = 1e+200"),
-    ("robot_map", lambda: change("robot_map", "[rest]\n", f"[rest]\na = {MANY}\n"), "a number is needed"),
-    ("table", lambda: change("table", "[0.0, 0.0, 0.0]", "[0.0, 1e308, 0.0]"), "three numbers"),
+    ("robot_map", lambda: change("robot_map", "[rest]\n", f"[rest]\na = {MANY}\n"), "a number from"),
+    ("table", lambda: change("table", "[0.0, 0.0, 0.0]", "[0.0, 1e308, 0.0]"), "a number [m] from"),
     ("table", lambda: change("table", 'forward = "+x"\n[', 'forward = { link = "a" }\n['), "forward = {'link': 'a'}"),
     *(
         ("protocol", lambda text=text: change_direction(text), "three numbers are needed")

@@ -526,7 +526,7 @@ BAD_TABLES = {
     "unknown point": (table_toml(more='[draw]\npaths = ["left_elbo"]'), "did you mean 'left_elbow'"),
     "unknown axis": ('up = "z"\n' + table_toml(), "up = 'z'"),
     "parallel axes": ('up = "+x"\n' + table_toml(), "is parallel to up"),
-    "no number": (table_toml(more='[points]\nleft_palm = {link = "torso", at = [1, 2]}'), "three numbers [m]"),
+    "no number": (table_toml(more='[points]\nleft_palm = {link = "torso", at = [1, 2]}'), "3 numbers [m]"),
     "no name": (table_toml(more="[points]\nleft_palm = 3"), "points.left_palm = 3 is not a table"),
     "half": (table_toml(OTHER | {"torso": '{link = "L_torso", up = "+z"}'}), "torso.forward is missing"),
     "no link": (table_toml(OTHER | {"torso": "L_troso"}), "segments.torso: no link 'L_troso'; did you mean 'L_torso'"),

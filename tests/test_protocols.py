@@ -204,7 +204,7 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
         ('"coincide"', '"distance"', r"closure 1.kind = 'distance' is not known"),
         ("slip = 0.005", 'slip = "half"', r"slip = 'half'; a number \[m\] from 0.0001 to 0.1"),
         ("slip =", "slipp =", r"closure 1.slipp is not a known key; did you mean 'slip'"),
-        ("kind =", "# kind =", r"closure 1.kind is missing; a text \(there is: coincide"),
+        ("kind =", "# kind =", r"closure 1.kind is missing; there is: coincide"),
         ("[[closure]]", "[[closures]]", r"closures is not a known key; did you mean 'closure'"),
         ("[[closure]]", "pose = 3\n[[closure]]", r"pose = 3 is no list of tables; write \[\[pose\]\]"),
         ("[[closure]]", "[[step]]\nseconds = 3\n[[closure]]", r"step 1.phase is missing"),
@@ -218,10 +218,10 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
         ),
         ("needs =", "measured_example = 'foo=1'\nneeds =", "measured_example: 'foo' is no length"),
         ("needs =", "needs ==", r"not valid TOML"),
-        ("needs =", "needs = 3 #", r"needs = 3; a name is wanted, or a list of names"),
-        ("needs =", "needs = [3] #", r"needs = \[3\]; a name is wanted, or a list of names"),
+        ("needs =", "needs = 3 #", r"needs = 3; a text, or a list of texts is needed"),
+        ("needs =", "needs = [3] #", r"needs\[0\] = 3; a text is needed"),
         ("points =", "points = 'left_palm' #", r"closure 1.points = \['left_palm'\]; kind 'coincide' takes 2"),
-        ("points =", "points = [['left_palm'], 'right_palm'] #", r"a name is wanted, or a list of names"),
+        ("points =", "points = [['left_palm'], 'right_palm'] #", r"points\[0\] = \['left_palm'\]; a text is needed"),
     ):
         own.write_text(FILE.replace(old, new))
         with pytest.raises(BadOption, match=match) as caught:

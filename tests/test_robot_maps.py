@@ -110,7 +110,7 @@ def test_the_page_has_the_keys_that_are_tested() -> None:
         ("shoulder =", "schoulder =", "arms.right.schoulder is not a known key; did you mean 'shoulder'"),
         ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
         ("elbow = -1.2", "elbo = -1.2", "rest: no moving joint 'elbo' in arm.urdf; did you mean 'elbow'"),
-        ("offset = [0.0, 0.0, -0.1]", "offset = [0.0, 0.0]", r"hand.offset = \[0.0, 0.0\]; three numbers \[m\]"),
+        ("offset = [0.0, 0.0, -0.1]", "offset = [0.0, 0.0]", r"hand.offset = \[0.0, 0.0\]; a list of 3 numbers \[m\]"),
         ("yaw = 12.0", "yaw = 12.0\n[limits.jerk]\nyaw = -5.0", "limits.jerk: joint 'yaw' is -5"),
         (
             "[limits.acceleration]",

@@ -77,18 +77,18 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
         GOOD + '[pairs]\nelbow = "tipp"\n',
         ("pairs", "'tipp' is not known", "did you mean 'tip'"),
     ),
-    "a point in millimetres": (GOOD.replace("0.15", "150.0"), ("points.tip.at", "150.0", "numbers [m] from -10 to 10")),
+    "a point in millimetres": (GOOD.replace("0.15", "150.0"), ("points.tip.at", "150.0", "number [m] from -10 to 10")),
     "a girdle of a point that is none": (
         GOOD + GIRDLE.replace("girdles.elbow", "girdles.elbov"),
         ("girdles", "'elbov' is not known", "did you mean 'elbow'"),
     ),
     "a girdle with two joints": (
         GOOD + GIRDLE.replace(', "elbow_joint"', ""),
-        ("girdles.elbow", "['shoulder_pan_joint', 'shoulder_lift_joint']", "three names"),
+        ("girdles.elbow", "['shoulder_pan_joint', 'shoulder_lift_joint']", "3 texts"),
     ),
     "a girdle whose law is less than certain": (
         GOOD + GIRDLE + "law_std = -0.5\n",
-        ("girdles.elbow.law_std = -0.5", "from 0 on"),
+        ("girdles.elbow.law_std = -0.5", "a number from 0"),
     ),
     "soft tissue with an unknown key": (
         GOOD.replace(
@@ -136,7 +136,7 @@ PROTOCOLS: dict[str, tuple[str, tuple[str, ...]]] = {
     "an unknown kind": (PROTOCOL.replace("fixed_point", "fixed"), ("closure 1.kind", "'fixed'", "fixed_point")),
     "two points of one": (PROTOCOL.replace('["tip"]', '["tip", "elbow"]'), ("closure 1.points", "elbow", "takes 1")),
     "a key of another kind": (PROTOCOL + 'distance = "base"\n', ("closure 1.distance", "is not a known key", "points")),
-    "a place that is none": (PROTOCOL + "at = [1.0, 2.0]\n", ("closure 1.at", "[1.0, 2.0]", "three numbers")),
+    "a place that is none": (PROTOCOL + "at = [1.0, 2.0]\n", ("closure 1.at", "[1.0, 2.0]", "3 numbers")),
     "an origin that is none": (
         PROTOCOL.replace("fixed_point", "recorded") + 'origin = "bass"\n',
         ("'bass'", "did you mean 'base'"),

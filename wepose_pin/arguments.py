@@ -1,6 +1,6 @@
-"""Checks of the arguments of public functions against their annotations.
+"""The checker of values against annotations: arguments of public functions, fields, and what stands in a TOML file.
 
-``check_arguments(track, locals())`` is the first line of such a function. The annotation defines the check: a
+``check_arguments(track, locals())`` is the first line of a public function. The annotation defines the check: a
 `Positive` number, a choice of a `Literal`, a class. An object with a method `check` is checked by it. Inner functions
 do no checks.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
@@ -30,10 +31,16 @@ class Range:
     closed: bool
     high: float = math.inf
     infinite: bool = False
+    unit: str = ""
 
     def __str__(self) -> str:
-        up_to = "" if math.isinf(self.high) else f", up to {self.high:g}"
-        return f"{'at least' if self.closed else 'above'} {self.low:g}{up_to}"
+        unit = f" [{self.unit}]" if self.unit else ""
+        if self.low <= -1e300:
+            return f"a finite number{unit}"
+        if self.closed and math.isfinite(self.high):
+            return f"a number{unit} from {self.low:g} to {self.high:g}"
+        kind, up_to = "" if self.infinite else "finite ", "" if math.isinf(self.high) else f", up to {self.high:g}"
+        return f"a {kind}number{unit} {'at least' if self.closed else 'above'} {self.low:g}{up_to}"
 
     def __contains__(self, value: float) -> bool:
         above = self.low <= value if self.closed else self.low < value
@@ -53,20 +60,22 @@ class _Rule(NamedTuple):
     words: str
     limits: Range | None = None
     choices: tuple[Any, ...] = ()
-    parts: tuple[Any, ...] = ()  # annotations of what a tuple or a mapping holds
+    parts: tuple[Any, ...] = ()  # annotations of what a list or a mapping holds
+
+    def takes(self, value: Any) -> bool:
+        number = self.kind in (Real, Integral)
+        return isinstance(value, self.kind) and not (number and (isinstance(value, bool) or value != value))
 
 
 _KINDS: dict[Any, tuple[Any, str]] = {
     float: (Real, "a number"),
     int: (Integral, "a whole number"),
-    bool: (bool | np.bool_, "True or False"),
+    bool: (bool | np.bool_, "true or false"),
     str: (str, "a text"),
     Path: (os.PathLike, "a path"),
     Any: (object, "a value"),
     NoneType: (NoneType, "None"),
     np.ndarray: (np.ndarray | list | tuple, "an array"),
-    tuple: (tuple | list, "a tuple"),
-    Sequence: (tuple | list, "a list"),
     Mapping: (Mapping, "a mapping of names to values"),
     Callable: (Callable, "a function"),
 }
@@ -79,14 +88,23 @@ def _find_rules(hint: Any) -> tuple[_Rule, ...]:
         return tuple(rule for part in parts for rule in _find_rules(part))
     if origin is Annotated:
         limits = next((note for note in parts[1:] if isinstance(note, Range)), None)
-        if limits is None:
-            return _find_rules(parts[0])
-        words = f"a {'' if limits.infinite else 'finite '}number {limits}"
-        return tuple(rule._replace(limits=limits, words=words) for rule in _find_rules(parts[0]))
+        if limits is None or get_origin(parts[0]) is not tuple:
+            rules = _find_rules(parts[0])
+            return rules if limits is None else tuple(each._replace(limits=limits, words=str(limits)) for each in rules)
+        origin, parts = tuple, tuple(each if each is ... else Annotated[each, limits] for each in get_args(parts[0]))
     if origin is Literal:
-        return (_Rule(str, f"one of {', '.join(parts)}", choices=parts),)
+        return (_Rule(str, f"one of {', '.join(filter(None, parts))}", choices=parts),)
+    if (origin or hint) in (tuple, Sequence):
+        count = f"{len(parts)} " if origin is tuple and ... not in parts else ""
+        items = re.sub(r"^an? ((whole |finite )?\w+)", r"\1s", describe(parts[0])) if parts else "values"
+        return (_Rule(tuple | list, f"a list of {count}{items}", parts=parts),)
     kind, words = _KINDS.get(origin or hint) or (origin or hint, f"an object of class {(origin or hint).__name__}")
     return (_Rule(kind, words, parts=parts),)
+
+
+def describe(hint: Any) -> str:
+    """Return what an annotation takes in words, such as "a number [deg] from 0 to 90"."""
+    return ", or ".join(dict.fromkeys(rule.words for rule in _find_rules(hint)))
 
 
 @cache
@@ -96,11 +114,11 @@ def _read_hints(function: Any) -> dict[str, Any]:
 
 
 def check_arguments(function: Any, arguments: Mapping[str, Any]) -> None:
-    """Check every argument against the annotation of its name in a function, or in the constructor of a class.
+    """Check every argument of a function against the annotation of its name.
 
     Raise `BadOption` where one does not fit, or what its own `check` raises.
     """
-    for name, hint in _read_hints(getattr(function, "__init__") if isinstance(function, type) else function).items():  # noqa: B009
+    for name, hint in _read_hints(function).items():
         if name in arguments:
             check_value(name, arguments[name], hint)
 
@@ -111,30 +129,24 @@ def check_fields(value: Any, place: str, kind: type | None = None) -> None:
         check_value(f"{place}{name}", getattr(value, name), hint)
 
 
-def check_value(place: str, value: Any, hint: Any) -> None:
-    """Check a value and its contents against an annotation; `place` begins the error's text."""
+def check_value(place: str, value: Any, hint: Any, error: type[Exception] = BadOption) -> None:
+    """Check a value and its contents against an annotation; `place` begins the text of the `error` that is raised."""
     rules = _find_rules(hint)
-    for rule in rules:
-        number = rule.kind in (Real, Integral)
-        if isinstance(value, rule.kind) and not (number and (isinstance(value, bool | np.bool_) or value != value)):
-            break
-    else:
-        words = ", or ".join(dict.fromkeys(rule.words for rule in rules))
-        raise BadOption(f"{place} = {_show(value)}: {words} is needed")
-    if rule.limits is not None and value not in rule.limits:
-        raise BadOption(f"{place} = {_show(value)}: {rule.words} is needed")
+    rule = next((rule for rule in rules if rule.takes(value)), None)
+    if rule is None or (rule.limits is not None and value not in rule.limits):
+        raise error(f"{place} = {_show(value)}; {rule.words if rule else describe(hint)} is needed")
     if rule.choices and value not in rule.choices:
-        raise BadOption(f"{place} = {_show(value)} is not known; {one_of(rule.choices, value)}")
+        raise error(f"{place} = {_show(value)} is not known; {one_of(filter(None, rule.choices), value)}")
     if isinstance(value, Mapping):
         for name, entry in value.items() if rule.parts else ():
-            check_value(f"{place}: name", name, rule.parts[0])
-            check_value(f"{place}.{name}", entry, rule.parts[1])
+            check_value(f"{place}: name", name, rule.parts[0], error)
+            check_value(f"{place}.{name}", entry, rule.parts[1], error)
     elif rule.parts and isinstance(value, tuple | list):
         each = [rule.parts[0]] * len(value) if rule.parts[-1] is ... or len(rule.parts) == 1 else rule.parts
         if len(value) != len(each):
-            raise BadOption(f"{place} = {_show(value)}: {len(each)} values are needed, not {len(value)}")
+            raise error(f"{place} = {_show(value)}; {rule.words} is needed")
         for k, (entry, part) in enumerate(zip(value, each, strict=True)):
-            check_value(f"{place}[{k}]", entry, part)
+            check_value(f"{place}[{k}]", entry, part, error)
     elif rule.kind is not object and (is_dataclass(value) or hasattr(value, "_fields")):
         value.check() if hasattr(value, "check") else check_fields(value, f"{place}.")
 

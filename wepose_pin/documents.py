@@ -10,15 +10,17 @@ import re
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
-from numbers import Real
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
+import numpy as np
+
+from .arguments import Range, check_value, describe
 from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
 
 R = TypeVar("R")
@@ -99,20 +101,23 @@ class TomlTable:
             raise self.error(f"{self.at(key)} = {value!r} is no list of tables; write [[{self.place}{key}]]")
         return [replace(self, values=each, place=f"{self.place}{key} {k + 1}.") for k, each in enumerate(value)]
 
+    def _get(self, key: str, default: Any, hint: Any) -> Any:
+        value = self.values.get(key, default)
+        if value is not None:
+            check_value(self.at(key), value, hint, self.error)
+        return value
+
     def text(self, key: str, default: str | None) -> str | None:
         """Return a text that is not empty; `default` where the key is missing."""
-        value = self.values.get(key, default)
-        if value is not None and (not isinstance(value, str) or not value):
-            raise self.error(f"{self.at(key)} = {value!r} is not a text; write it in quotes")
+        value: str | None = self._get(key, default, str)
+        if value == "" != default:
+            raise self.error(f"{self.at(key)} is empty; write a text, or leave it out")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of texts, or the one that stands in its place; empty where the key is missing."""
-        value = self.values.get(key) or ()
-        value = (value,) if isinstance(value, str) else value
-        if not isinstance(value, list | tuple) or not all(isinstance(each, str) for each in value):
-            raise self.error(f"{self.at(key)} = {value!r}; a name is wanted, or a list of names")
-        return tuple(value)
+        value = self._get(key, (), str | tuple[str, ...])
+        return (value,) if isinstance(value, str) else tuple(value)
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
         """Return one of the choices."""
@@ -124,37 +129,29 @@ class TomlTable:
 
     def flag(self, key: str) -> bool:
         """Return true or false; false where the key is missing."""
-        value = self.values.get(key, False)
-        if not isinstance(value, bool):
-            raise self.error(f"{self.at(key)} = {value!r} is neither true nor false")
-        return value
+        return bool(self._get(key, False, bool))
 
     def number(self, key: str, default: float | None) -> float | None:
         """Return a finite number; `default` where the key is missing."""
-        value = self.values.get(key, default)
-        if value is None:
-            return None
-        if not is_number(value):
-            raise self.error(f"{self.at(key)} = {_format_value(value)} is not a number")
-        return float(value)
+        value = self._get(key, default, _FINITE)
+        return None if value is None else float(value)
 
     def names(self, key: str, count: int) -> list[str]:
         """Return a list of `count` different names of columns."""
         value = self.values.get(key)
         names = [name for name in value if isinstance(name, str)] if isinstance(value, list) else []
         if names != value or len(names) != count or len(set(names)) < count:
-            state = "is missing" if value is None else f"= {_format_value(value)}"
+            state = "is missing" if value is None else f"= {value!r}"
             raise self.error(f"{self.at(key)} {state}; a list of {count} different column names is needed")
         return names
+
+
+_FINITE = Annotated[float, Range(-1e300, closed=True, high=1e300)]
 
 
 def is_number(value: Any, below: float = 1e300) -> TypeGuard[float]:
     """Return whether a value is a finite int or float smaller than `below`, and no boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < below
-
-
-def _format_value(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
 # Writing -----------------------------------------------------------------------------------------------------------
@@ -176,9 +173,21 @@ def toml_key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_string(name)
 
 
+def format_toml(values: Mapping[str, Any], place: str = "") -> Iterator[str]:
+    """Yield the lines of a TOML table: `values` are texts in TOML, and tables of those by name; tables come last."""
+    for name, value in values.items():
+        if isinstance(value, str):
+            yield f"{toml_key(name)} = {value}"
+    for name, value in values.items():
+        if not isinstance(value, str):
+            heading = f"{place}{toml_key(name)}"
+            if not value or any(isinstance(each, str) for each in value.values()):
+                yield from ("", f"[{heading}]")
+            yield from format_toml(value, f"{heading}.")
+
+
 # Records -----------------------------------------------------------------------------------------------------------
 
-_COUNTS = ("", "a number", "two numbers", "three numbers")
 # Unit in a file → to SI, and back.
 _UNITS: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "deg": (math.radians, math.degrees),
@@ -202,11 +211,13 @@ class Key:
     most: float = 1e6
     of: str = ""  # what texts name; `read_record` is given the names that there are
     words: Mapping[str, Any] = field(default_factory=dict, hash=False)  # text in the file → value of the field
-    omit_zero: bool = False  # zeros are not written
     each: tuple[str, ...] = ()  # the keys of an array's numbers
     unread: tuple[str, ...] = ()  # keys beside those, in tables of arrays, written for whoever looks at the file
     digits: int | None = None  # decimals that are written; None: all that count
-    comment: str = ""  # behind the heading of a table
+
+    @property
+    def limits(self) -> Range:
+        return Range(self.least, closed=True, high=self.most, unit=self.unit.replace("_", "/"))
 
 
 @cache
@@ -244,133 +255,79 @@ def read_record(
     arrays = {name: key.each for name, (value_type, key) in keys.items() if get_origin(value_type) is not Mapping}
     table.allow(*(part for name, (_, key) in keys.items() for part in arrays.get(name) or (key.name,)), *others)
     for name, (value_type, key) in keys.items():
-        if arrays.get(name) or table.values.get(key.name) is not None:
+        if arrays.get(name) or table.values.get(key.name) is not None or name not in values:
             values[name] = _read_value(value_type, table, key, known or {}, values.get(name))
-        elif name not in values:
-            raise table.error(f"{table.at(key.name)} is missing; {_describe(value_type, key, known or {})} needed")
     return kind(**values)
 
 
-def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]], value: Any = None) -> str:
-    """Describe what is right in place of `value`, with its verb, as "two numbers [mm] from 0 to 90 are"."""
-    parts = get_args(value_type) or (value_type,)
-    if parts[0] is not float:
-        choices = f" ({one_of(known.get(key.of, key.words))})" if key.of or key.words else ""
-        one = "a table" if hasattr(value_type, "_fields") else "a list of names" if ... in parts else "a text"
-        return "three names are" if len(parts) == 3 else f"{one}{choices} is"
-    unit = f" [{key.unit.replace('_', '/')}]" if key.unit else ""
-    limits = f" from {key.least:g}{f' to {key.most:g}' if key.most < 1e6 else ' on'}" if key.least > -1e6 else ""
-    numbers = [each for each in (value if isinstance(value, list | tuple) else (value,)) if is_number(each)]
-    if any(each > key.most or (each < key.least and not limits) for each in numbers):
-        limits = f" from {key.least:g} to {key.most:g}"
-    return f"{_COUNTS[len(parts)]}{unit}{limits} {'are' if len(parts) > 1 else 'is'}"
-
-
-def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str, Collection[str]], base: Any) -> Any:
-    value, parts = table.values.get(key.name), get_args(value_type)
-    if hasattr(value_type, "_fields"):
+def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Collection[str]], base: Any) -> Any:
+    """Read the value of a key, of a type `hint`; `base` has what a table in its place lacks."""
+    value, parts = table.values.get(key.name), get_args(hint)
+    if hasattr(hint, "_fields"):
         if isinstance(value, str):
-            table = replace(table, values={key.name: {next(iter(_find_keys(value_type).values()))[1].name: value}})
-        return read_record(value_type, table.table(key.name), known, base)
-    if get_origin(value_type) is Mapping:
-        entries = table.table(key.name)
-        if key.each:
-            for entry in map(entries.table, entries.values):
-                entry.allow(*key.each, *key.unread)
-            return {name: _read_value(parts[1], entries.table(name), key, known, None) for name in entries.values}
-        return {**(base or {})} | {
-            name: _read_value(parts[1], entries, replace(key, name=name), known, (base or {}).get(name))
-            for name in entries.values
-        }
+            table = replace(table, values={key.name: {next(iter(_find_keys(hint).values()))[1].name: value}})
+        return read_record(hint, table.table(key.name), known, base)
+    if get_origin(hint) is Mapping:
+        entries, values = table.table(key.name), dict(base or {})
+        for name in entries.values:
+            if key.each:
+                entries.table(name).allow(*key.each, *key.unread)
+            own = entries.table(name) if key.each else entries
+            values[name] = _read_value(parts[1], own, replace(key, name=name), known, values.get(name))
+        return values
     if key.each:
-        import numpy as np  # not for whoever reads none
-
         return np.array([_read_value(float, table, replace(key, name=part, each=()), {}, None) for part in key.each])
-    if key.words:
-        return key.words[table.choice(key.name, key.words)]
-    if get_origin(value_type) is Literal:
-        return table.choice(key.name, filter(None, parts))
-    if value_type is bool:
-        return table.flag(key.name)
-    if value_type is str:
-        return table.choice(key.name, known[key.of]) if key.of else table.text(key.name, None)
-    if str in parts:
-        texts = table.texts(key.name)
-        for text in texts if key.of else ():
-            if text not in known[key.of]:
-                raise table.error(f"{table.at(key.name)}: '{text}' is not known; {one_of(known[key.of], text)}")
-        if ... in parts or len(texts) == len(parts):
-            return texts
-    elif ... in parts and isinstance(value, list):  # of lists
-        rows = (replace(table, values={key.name: row}) for row in value)
-        return tuple(_read_value(parts[0], row, key, known, None) for row in rows)
-    elif parts or value_type is float:
-        numbers = value if parts and isinstance(value, list | tuple) else [value]
-        each = [_to_si(key, number) for number in numbers if is_number(number) and key.least <= number <= key.most]
-        if len(each) == len(numbers) == max(len(parts), 1):
-            return tuple(each) if parts else each[0]
-    state = f" = {_format_value(value)};" if key.name in table else " is missing;"
-    raise table.error(f"{table.at(key.name)}{state} {_describe(value_type, key, known, value)} needed")
+    names: Collection[str] = known[key.of] if key.of else key.words
+    hint = str if key.words else Annotated[hint, key.limits] if float in (hint, *parts) else hint
+    if value is None:
+        needed = one_of(names) if names else f"{describe(hint)} is needed"
+        raise table.error(f"{table.at(key.name)} is missing; {needed}")
+    if isinstance(value, str) and str in parts and get_origin(hint) is tuple:
+        value = [value]  # one name in place of a list
+    check_value(table.at(key.name), value, hint, table.error)
+    for text in value if isinstance(value, list) else [value]:
+        if text == "" or (names and text not in names):
+            raise table.error(f"{table.at(key.name)} = '{text}' is not known; {one_of(names, text)}")
+    return key.words[str(value)] if key.words else _convert(value, key)
 
 
-def _to_si(key: Key, value: float) -> float:
-    return _UNITS[key.unit][0](value) if key.unit in _UNITS else float(value)
+def _convert(value: Any, key: Key) -> Any:
+    """Convert what stands in a file: numbers to SI, lists to tuples."""
+    if isinstance(value, list):
+        return tuple(_convert(each, key) for each in value)
+    return value if isinstance(value, str | bool) else _UNITS.get(key.unit, (float,))[0](value)
 
 
-def format_record(record: Any, unread: Mapping[str, Sequence[str]] | None = None) -> list[str]:
-    """Return the lines of a record in a TOML file, tables last; None, false and what is empty are left out.
-
-    `unread` : heading of a table → lines beside those of its fields.
-    """
-    lines, tables = [], []
-    for name, (value_type, key) in _find_keys(record.__class__).items():
-        value, comment = getattr(record, name), f"   # {key.comment}" if key.comment else ""
-        if isinstance(value, Mapping):
-            if value or float in get_args(value_type):
-                tables += _format_mapping(key, value, comment, unread or {})
-        elif key.each:
-            lines += _format_each(key, value)
-        elif not (value is None or value is False or (isinstance(value, str | tuple) and not value)) and (
-            not key.omit_zero or any(value)
-        ):
-            lines.append(f"{key.name} = {_format_field(key, value)}{comment}")
-    return lines + tables
+def format_record(record: Any) -> dict[str, Any]:
+    """Return key → its value in TOML, for `format_toml`; None, false and what is empty are left out."""
+    values: dict[str, Any] = {}
+    for name, (hint, key) in _find_keys(record.__class__).items():
+        value = getattr(record, name)
+        if isinstance(value, np.ndarray):
+            values |= _format_value(key, value)
+        elif value or isinstance(value, float) or (isinstance(value, Mapping) and float in get_args(hint)):
+            values[key.name] = _format_value(key, value)
+    return values
 
 
-def _format_mapping(
-    key: Key, values: Mapping[str, Any], comment: str, unread: Mapping[str, Sequence[str]]
-) -> list[str]:
-    if all(isinstance(value, Real | str) for value in values.values()):
-        numbers = {name: value if isinstance(value, str) else float(value) for name, value in values.items()}
-        own = [f"{toml_key(name)} = {_format_field(key, value)}" for name, value in numbers.items()]
-        return ["", f"[{key.name}]{comment}", *own]
-    lines = []
-    for name, value in values.items():
-        heading = f"{key.name}.{toml_key(name)}"
-        if isinstance(value, Mapping):
-            lines += _format_mapping(replace(key, name=heading), value, comment, unread)
-        else:
-            own = _format_each(key, value) if key.each else format_record(value)
-            lines += ["", f"[{heading}]{comment}", *own, *unread.get(heading, ())]
-    return lines
-
-
-def _format_each(key: Key, values: Iterable[float]) -> list[str]:
-    return [f"{part} = {_format_field(key, float(value))}" for part, value in zip(key.each, values, strict=True)]
-
-
-def _format_field(key: Key, value: Any) -> str:
+def _format_value(key: Key, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _format_value(key, each) for name, each in value.items()}
+    if hasattr(value, "_fields"):
+        return format_record(value)
+    if isinstance(value, np.ndarray):
+        return dict(zip(key.each, (_format_value(key, float(each)) for each in value), strict=True))
     if key.words:
         return toml_string(next(word for word, meaning in key.words.items() if meaning == value))
-    if hasattr(value, "_fields"):
-        return f"{{ {', '.join(format_record(value))} }}"
     if isinstance(value, tuple):
-        return f"[{', '.join(_format_field(key, each) for each in value)}]"
-    if isinstance(value, float) and key.unit in _UNITS:
+        return f"[{', '.join(_format_value(key, each) for each in value)}]"
+    if isinstance(value, str):
+        return toml_string(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    if key.unit in _UNITS:
         value = round(_UNITS[key.unit][1](value), 6 if key.digits is None else key.digits)
-    if isinstance(value, float) and key.digits is not None:
-        return f"{value:.{key.digits}f}"
-    return toml_string(value) if isinstance(value, str) else _format_value(value)
+    return repr(float(value)) if key.digits is None else f"{value:.{key.digits}f}"
 
 
 # Atomic output -------------------------------------------------------------------------------------------------------

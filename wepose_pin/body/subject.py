@@ -18,10 +18,10 @@ from ..documents import (
     Key,
     TomlTable,
     format_record,
+    format_toml,
     parse_toml,
     read_record,
     read_toml,
-    toml_key,
     toml_strings,
     whole_file,
 )
@@ -47,14 +47,9 @@ MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person ha
 _OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4)
 _DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=4)  # of a heading: up to 100 deg/s
 _UNIT = Key(least=-1.001, most=1.001, digits=9)  # of a component of a unit vector
-_MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",), comment="R_LS, sensor to segment")
-_GIRDLE = Key(
-    least=-LONGEST,
-    most=LONGEST,
-    each=PARAMETERS,
-    digits=6,
-    comment="m, off the law of the body's table: its place at rest, and what is added at 90 deg",
-)
+_MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",))
+_GIRDLE = Key(least=-LONGEST, most=LONGEST, each=PARAMETERS, digits=6)
+_COMMENT = "# Lengths and girdles in m; mounts turn the sensor's frame to the segment's; see docs/calibrate.md"
 
 
 class Hinge(NamedTuple):
@@ -105,22 +100,16 @@ class Subject:
     """
 
     name: str
-    lengths: Annotated[Mapping[str, float], Key("lengths", "m", 1e-4, LONGEST, digits=6, comment="m")]
+    lengths: Annotated[Mapping[str, float], Key("lengths", "m", 1e-4, LONGEST, digits=6)]
     order: Annotated[tuple[str, ...], None]
     covariance: Annotated[np.ndarray, None]
     mounts: Annotated[Mapping[str, np.ndarray], _MOUNT] = field(default_factory=dict)
     note: str = ""
-    hinges: Annotated[Mapping[str, Hinge], Key(comment="its axis in the frame of the segment above")] = field(
-        default_factory=dict
-    )
-    start_pose_offset: Annotated[
-        Mapping[str, StartPoseOffset], Key(comment="off the start pose in the calibration, about x and y of W")
-    ] = field(default_factory=dict)
-    heading_drift: Annotated[Mapping[str, HeadingDrift], Key(comment="of its sensor's heading in the calibration")] = (
-        field(default_factory=dict)
-    )
+    hinges: Mapping[str, Hinge] = field(default_factory=dict)
+    start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
+    heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
     girdles: Annotated[Mapping[str, np.ndarray], _GIRDLE] = field(default_factory=dict)
-    quality: Annotated[Literal["", "pass", "poor", "fail"], Key(comment="of the calibration: pass, poor or fail")] = ""
+    quality: Literal["", "pass", "poor", "fail"] = ""
 
     def __repr__(self) -> str:
         quality = f", calibration {self.quality}" if self.quality else ""
@@ -414,20 +403,15 @@ def population_subject(
 
 def subject_toml(subject: Subject) -> str:
     """Return the text of ``subject.toml``."""
-    stds = {
-        f"mounts.{toml_key(segment)}": [f"std_deg = {np.degrees(np.sqrt(np.trace(cov) / 3.0)):.3f}"]
-        for segment in subject.mounts
-        if (cov := subject.mount_covariance(segment)) is not None
-    }
-    lines = [f"format = {FORMAT}", *format_record(subject, stds)]
+    values = {"format": str(FORMAT), **format_record(subject)}
+    for segment in subject.mounts:
+        if (cov := subject.mount_covariance(segment)) is not None:
+            values["mounts"][segment]["std_deg"] = f"{np.degrees(np.sqrt(np.trace(cov) / 3.0)):.3f}"
     if subject.order:
-        lines += ["", "[lengths_std]   # m, one standard deviation"]
-        lines += [f"{toml_key(k)} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
-        lines += ["", "[covariance]    # of lengths [m], mount errors [rad] and girdles [m], jointly"]
-        lines += [f"order = {toml_strings(subject.order)}", "matrix = ["]
-        lines += ["    [" + ", ".join(f"{v:.9e}" for v in row) + "]," for row in subject.covariance]
-        lines.append("]")
-    return "\n".join(lines) + "\n"
+        values["lengths_std"] = {name: f"{subject.std(name):.6f}" for name in subject.lengths if name in subject.order}
+        rows = [f"    [{', '.join(f'{v:.9e}' for v in row)}],\n" for row in subject.covariance]
+        values["covariance"] = {"order": toml_strings(subject.order), "matrix": f"[\n{''.join(rows)}]"}
+    return "\n".join([_COMMENT, *format_toml(values)]) + "\n"
 
 
 def load_subject(path: str | Path) -> Subject:
@@ -475,8 +459,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     if values.get("format") != FORMAT:
         has = f"format = {values.get('format')!r}"
         raise BadSubject(f"{path}: {has}; a subject, as `wepose calibrate` writes one, has format = {FORMAT}")
-    if "lengths" not in top:
-        raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
+    top.table("lengths")
     base = Subject(path.parent.name, {}, (), np.zeros((0, 0)))
     subject = read_record(Subject, top, base=base, others=("format", "lengths_std", "covariance"))
     table, std = top.table("covariance", {}), top.table("lengths_std", {})

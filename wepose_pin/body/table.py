@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from ..assets import asset
-from ..documents import Key, TomlTable, format_record, read_record, read_toml
+from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml
 from ..errors import BadModel, one_of
 from ..recording.sensors import AXES, read_axes
 from .girdle import Direction, Girdle, SegmentName
@@ -46,18 +46,15 @@ class SoftTissue(NamedTuple):
     per_tilt: Annotated[Vector, Key(least=0.0)] = ZERO  # [rad/rad] per tilt of the long axis since the start pose
     per_twist: float = 0.0  # [rad/rad] about the long axis, per rotation of the segment about it since the start pose
     raised: tuple[str, ...] = ()  # segments on which it depends too, such as the arms for a sensor on the torso
-    per_raised: Annotated[Vector, Key(least=0.0, omit_zero=True)] = (
-        ZERO  # [rad/rad] per mean angle of these off hanging
-    )
-    mean_per_tilt: Annotated[Vector, Key(omit_zero=True)] = ZERO
+    per_raised: Annotated[Vector, Key(least=0.0)] = ZERO  # [rad/rad] per mean angle of these off hanging
+    mean_per_tilt: Vector = ZERO
     mean_per_twist: float = 0.0
-    mean_per_raised: Annotated[Vector, Key(omit_zero=True)] = ZERO
+    mean_per_raised: Vector = ZERO
 
 
-def _same(degrees: float) -> tuple[float, float, float]:
+def _same(degrees: float) -> Vector:
     """Return the angle [rad] for each of three axes."""
-    angle = float(np.deg2rad(degrees))
-    return angle, angle, angle
+    return (float(np.deg2rad(degrees)),) * 3
 
 
 class Segment(NamedTuple):
@@ -67,18 +64,15 @@ class Segment(NamedTuple):
     # The link's axes that point up and forward in the N-pose; None: found with all joints at zero.
     up: Annotated[str | None, Key(of="axes")] = None
     forward: Annotated[str | None, Key(of="axes")] = None
-    along: Direction = (
-        0.0,
-        0.0,
-        -1.0,
-    )  # unit, its long axis in its own frame, away from the joint to the segment above
+    # Unit, its long axis in its own frame, away from the joint to the segment above.
+    along: Direction = (0.0, 0.0, -1.0)
     spine: bool = False  # its rotation is shared by all joints between it and the root
     # Without a sensor it is rigid with the segment above; False: it is unknown then.
     rigid_without_sensor: Annotated[bool, Key("without_sensor", words={"rigid": True, "unknown": False})] = False
     labels: str = ""  # a regular expression of words that mean it in a sensor's name
     joint: str = ""  # name of the joint to the segment above, where no point names it
     # [rad/rad] by which a foam under its sensor gives, per rotation of the segment.
-    foam_std: Annotated[Vector, Key("foam_deg", "deg", least=0.0, omit_zero=True)] = ZERO
+    foam_std: Annotated[Vector, Key("foam_deg", "deg", least=0.0)] = ZERO
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
     start_mean: Annotated[Vector, Key(unit="deg")] = ZERO  # [rad] mean rotation vector of people off the neutral pose
     start_std: Angles = _same(4.0)  # [rad] of its rotation off the start pose among people
@@ -96,7 +90,7 @@ class Point(NamedTuple):
     """The link on which a point lies, and where [m] in the link."""
 
     link: str
-    at: Annotated[Vector, Key("at", "m", -10.0, 10.0, omit_zero=True)] = ZERO
+    at: Annotated[Vector, Key("at", "m", -10.0, 10.0)] = ZERO
 
 
 class Length(NamedTuple):
@@ -132,8 +126,8 @@ class Place(NamedTuple):
 class Drawing(NamedTuple):
     """What is drawn of a body: lines through points, limb by limb, and the points whose path is drawn."""
 
-    limbs: Annotated[tuple[tuple[str, ...], ...], Key(of="points")] = ()
-    paths: Annotated[tuple[str, ...], Key(of="points")] = ()
+    limbs: tuple[tuple[str, ...], ...] = ()
+    paths: tuple[str, ...] = ()
 
 
 class Limb(NamedTuple):
@@ -167,9 +161,8 @@ class BodyTable:
     lengths: Mapping[str, Length] = field(default_factory=dict)
     hinges: Mapping[str, HingeJoint] = field(default_factory=dict)
     girdles: Mapping[str, Girdle] = field(default_factory=dict)  # shoulder point → how it moves on the trunk
-    poses: Mapping[str, Mapping[str, float]] = field(
-        default_factory=dict
-    )  # name → joint of the URDF → value [rad or m]
+    # Name → joint of the URDF → value [rad or m].
+    poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     pairs: Annotated[Mapping[str, str], Key(of="names")] = field(default_factory=dict)  # left → right
     sensors: Mapping[str, Place] = field(default_factory=dict)
     draw: Drawing = field(default_factory=Drawing)
@@ -263,39 +256,35 @@ class BodyTable:
 
 def prune_table(table: BodyTable) -> BodyTable:
     """Return the table without what needs segments or points that it lacks."""
-    segments, points = set(table.segments), {*table.points, ROOT}
-    lengths = {
-        name: length
-        for name, length in table.lengths.items()
-        if length.segment in segments and points.issuperset(length.start + length.end)
-    }
-    hinges = {name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= segments}
-    girdles = {
-        name: girdle
-        for name, girdle in table.girdles.items()
-        if name in points and {girdle.on, girdle.moves} <= segments
-    }
-    pruned = {}
+    segments, points = dict(table.segments), {*table.points, ROOT}
     for name, segment in table.segments.items():
         tissue = segment.soft_tissue
         tissue = tissue._replace(raised=tuple(other for other in tissue.raised if other in segments))
         if tissue.relative_to and tissue.relative_to not in segments:
             tissue = tissue._replace(relative_to="", per_tilt=ZERO, per_twist=0.0)
-        pruned[name] = segment._replace(soft_tissue=tissue)
-    names = {*segments, *points, *lengths, *hinges}
-    return replace(
+        segments[name] = segment._replace(soft_tissue=tissue)
+    pruned = replace(
         table,
-        segments=pruned,
-        lengths=lengths,
-        hinges=hinges,
-        girdles=girdles,
-        pairs={left: right for left, right in table.pairs.items() if {left, right} <= names},
+        segments=segments,
+        lengths={
+            name: length
+            for name, length in table.lengths.items()
+            if length.segment in segments and points.issuperset(length.start + length.end)
+        },
+        hinges={name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= set(segments)},
+        girdles={
+            name: girdle
+            for name, girdle in table.girdles.items()
+            if name in points and {girdle.on, girdle.moves} <= set(segments)
+        },
         sensors={name: place for name, place in table.sensors.items() if name in segments},
         draw=Drawing(
             tuple(limb for limb in table.draw.limbs if points.issuperset(limb)),
             tuple(point for point in table.draw.paths if point in points),
         ),
     )
+    names = {*segments, *points, *pruned.lengths, *pruned.hinges}
+    return replace(pruned, pairs={left: right for left, right in table.pairs.items() if {left, right} <= names})
 
 
 # The file ------------------------------------------------------------------------------------------------------------
@@ -335,49 +324,43 @@ def read_table(path: Path) -> BodyTable:
     that the file names, or all of the other body where it names none of them.
     """
     top = TomlTable(read_toml(path, "the table of a body", BadModel), str(path), error=BadModel)
-    own = {key: top.table(key, {}) for key in ("segments", "points", "lengths", "hinges")}
+    own = {key: top.table(key, {}).values for key in ("segments", "points", "lengths", "hinges")}
     like = load_table(top.choice("like", _list_bodies())) if "like" in top else BodyTable("", {})
     kind: Any = top.choice("kind", KINDS, like.kind)
     new = Segment.of_mechanism("", rigid=False) if kind == KINDS[1] else Segment("")
     segments = {
-        name: like.segments.get(name, new)._replace(link=name, up=None, forward=None) for name in own["segments"].values
+        name: like.segments.get(name, new)._replace(link=name, up=None, forward=None) for name in own["segments"]
     }
     whole = not set(segments) & set(like.segments)  # the same body with more on it
     segments = {**like.segments, **segments} if whole else segments
     begin = {segment.link: name for name, segment in like.segments.items() if name in segments}
     # A point at which a segment begins is there with the segment.
     points = {name: at for name, at in like.points.items() if whole or (at.link in begin and not any(at.at))}
-    points |= {name: Point(name) for name in own["points"].values}
-    poses = {NEUTRAL_POSE: dict[str, float]()}
-    base = BodyTable(path.stem, segments, kind=kind, points=points, poses=poses, where=str(path))
-    names = ("lengths", "hinges", "girdles", "pairs", "sensors", "draw")
-    base = prune_table(replace(base, **{name: getattr(like, name) for name in names}))
-
-    known = {key: {**getattr(base, key), **table.values} for key, table in own.items()}
-    known |= {
-        "names": {name: None for each in known.values() for name in each},
-        "points": {**known["points"], ROOT: None},
-    }
-    table = read_record(BodyTable, top, {**known, "axes": AXES}, base, others=("like",))
+    points |= {name: Point(name) for name in own["points"]}
+    file: Any = {"name": path.stem, "where": str(path), "urdf": "", "up": "+z", "forward": "+x", "root": ()}
+    poses: Any = {NEUTRAL_POSE: {}}
+    base = prune_table(replace(like, **file, kind=kind, segments=segments, points=points, poses=poses))
+    known: dict[str, Any] = {key: {**getattr(base, key), **values} for key, values in own.items()}
+    known |= {"names": {name for each in known.values() for name in each}, "axes": AXES}
+    table = read_record(BodyTable, top, known | {"points": {**known["points"], ROOT: None}}, base, others=("like",))
     if not table.segments:
         raise BadModel(f'{top.at("segments")} is missing; each segment\'s link is needed, as in torso = "chest_link"')
     points = dict(table.points)
     for name, point in base.points.items():
-        if name not in own["points"].values and point.link in begin:
+        if name not in own["points"] and point.link in begin:
             points[name] = Point(table.segments[begin[point.link]].link, point.at)
     table = replace(
         table,
         urdf=table.urdf or path.with_suffix(".urdf").name,
         segments={name: table.segments[name] for name in (*like.segments, *table.segments) if name in table.segments},
         points={name: points[name] for name in (*like.points, *points) if name in points},
-        hinges={name: _check_hinge(f"{top.at('hinges')}.{name}", hinge) for name, hinge in table.hinges.items()},
+        hinges={name: _normalise_hinge(f"{top.at('hinges')}.{name}", each) for name, each in table.hinges.items()},
     )
     _check_table(table, top)
     return table
 
 
-def _check_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
-    """Return the hinge with an axis of unit length."""
+def _normalise_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
     size = float(np.linalg.norm(hinge.axis))
     if size < 1e-6 or hinge.range[0] >= hinge.range[1] or hinge.on == hinge.moves:
         raise BadModel(f"{place}: two segments, an axis of some length and a range from the least on are needed")
@@ -388,12 +371,11 @@ def _check_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
 def _check_table(table: BodyTable, top: TomlTable) -> None:
     """Raise `BadModel` on names that the table does not know, parallel axes, and labels that are no expression."""
     names = (*table.segments, *table.points, *table.lengths, *table.hinges)
-    drawn = [*(point for limb in table.draw.limbs for point in limb), *table.draw.paths]
     for key, used, known in (
         ("girdles", table.girdles, table.points),
         ("sensors", table.sensors, table.segments),
         ("pairs", table.pairs, names),
-        ("draw", drawn, table.points),
+        ("draw", (*(point for limb in table.draw.limbs for point in limb), *table.draw.paths), table.points),
     ):
         for name in used:
             if name not in known:
@@ -408,8 +390,7 @@ def _check_table(table: BodyTable, top: TomlTable) -> None:
         try:
             re.compile(segment.labels)
         except re.error as error:
-            labels = f"{top.at(place)}labels = {segment.labels!r}"
-            raise BadModel(f"{labels} is no regular expression: {error}") from None
+            raise BadModel(f"{top.at(place)}labels = {segment.labels!r} is no regular expression: {error}") from None
 
 
 def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
@@ -434,4 +415,4 @@ def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
 
 def format_table(table: BodyTable, urdf: str) -> str:
     """Return the text of a table's file that names `urdf`, a URDF beside it."""
-    return "\n".join(format_record(replace(table, urdf=urdf))) + "\n"
+    return "\n".join(format_toml(format_record(replace(table, urdf=urdf)))) + "\n"
