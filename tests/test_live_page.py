@@ -7,50 +7,34 @@ import contextlib
 import http.client
 import json
 import math
-import re
-import subprocess
-import sys
+import socket
+import struct
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Awaitable, Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from arms import write_arm
 from browser import BROWSER, Browser
-from listening import NO_PROC, list_listening
 from sampling import wait_until
-from scipy.spatial.transform import Rotation
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-from wepose_pin.body import BodyModel, load_model
-from wepose_pin.body.configuration import solve_configuration
-from wepose_pin.body.kinematics import KinematicsSolver
-from wepose_pin.body.links import compute_link_placements
-from wepose_pin.errors import BadOption
+import wepose_pin as wp
 from wepose_pin.live import LivePose, Request, SensorStatus, Status, StreamInfo
-from wepose_pin.live.encoder import PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.state import Action
-from wepose_pin.retargeting import find_map, load_robot
+from wepose_pin.simulation import Simulation
 
-SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 NARROW = "document.documentElement.scrollWidth <= innerWidth"
 
 
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return load_model()
-
-
 @contextlib.contextmanager
-def serve(model: BodyModel, info: StreamInfo | None = None, **options: Any) -> Iterator[LivePage]:
+def serve(info: StreamInfo | None = None, **options: Any) -> Iterator[LivePage]:
     """An open page."""
-    page = LivePage(model, **options)
+    page = LivePage(wp.load_model(), **options)
     if info is not None:
         page.start(info)
     page.open()
@@ -59,20 +43,18 @@ def serve(model: BodyModel, info: StreamInfo | None = None, **options: Any) -> I
 
 
 class Person:
-    """A fake loop: arms that swing, and the status of their sensors."""
+    """A loop that shows a simulated motion, and the status of the sensors."""
 
-    def __init__(self, model: BodyModel, segments: tuple[str, ...] = SEGMENTS) -> None:
-        self._kinematics = KinematicsSolver(model, segments)
-        self.info = StreamInfo(segments, self._kinematics.points, 100.0)
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.info = StreamInfo(tuple(simulation.quat_WL), tuple(simulation.points), simulation.rate_hz)
 
     def pose(self, t: float, lost: tuple[str, ...] = ()) -> LivePose:
-        swing = {"torso": [0, 0, 0.2], "left_forearm": [0, -1.5, 0], "right_forearm": [0, -1.2 - 0.3 * math.sin(t), 0]}
-        quat_WL = np.array(
-            [Rotation.from_rotvec(swing.get(s, [0, -0.8 * math.sin(2 * t), 0])).as_quat() for s in self.info.segments]
-        )
-        points = self._kinematics.compute_points(quat_WL)
+        """That of ten seconds later, in which the arms move."""
+        k, simulation = round((t + 10.0) * self.simulation.rate_hz), self.simulation
+        quat, points = (np.array([v[k] for v in each.values()]) for each in (simulation.quat_WL, simulation.points))
         gone = np.array([segment in lost for segment in self.info.segments])
-        return LivePose(t, quat_WL, points, np.full(len(gone), 0.02), gone, 0.003)
+        return LivePose(t, quat, points, np.full(len(gone), 0.02), gone, 0.003)
 
     def status(self, state: str = "ready", message: str = "Tracking.", lost: tuple[str, ...] = ()) -> Status:
         sensors = tuple(
@@ -84,101 +66,18 @@ class Person:
 
 
 @pytest.fixture
-def person(model: BodyModel) -> Person:
-    return Person(model)
+def motion(simulation: Simulation) -> Person:
+    return Person(simulation)
 
 
 @pytest.fixture
-def page(model: BodyModel) -> Iterator[LivePage]:
-    with serve(model, title="<b>& circles") as page:
+def page() -> Iterator[LivePage]:
+    with serve(title="<b>& circles") as page:
         yield page
 
 
-def unpacked(model: BodyModel, frame: bytes) -> tuple[float, dict[str, np.ndarray], np.ndarray, dict[str, bool]]:
-    """Time, link → (12,), hands (2, 3), link → lost."""
-    links = PoseEncoder(model).links
-    n = len(links)
-    layout = np.dtype([("time", "<f8"), ("placed", "<f4", (n, 12)), ("hands", "<f4", (2, 3)), ("lost", "u1", n)])
-    (row,) = np.frombuffer(frame, layout)
-    lost = dict(zip(links, row["lost"].astype(bool).tolist(), strict=True))
-    return float(row["time"]), dict(zip(links, row["placed"], strict=True)), row["hands"], lost
-
-
-# What a frame holds -------------------------------------------------------------------------------------------------
-
-
-def test_a_frame_places_every_link_as_the_kinematics_do(model: BodyModel, person: Person) -> None:
-    encoder = PoseEncoder(model)
-    encoder.start(person.info)
-    pose = person.pose(0.7, lost=("left_forearm",))
-    time_s, placed, hands, lost = unpacked(model, encoder.encode(pose))
-    assert time_s == 0.7
-    q = solve_configuration(model, {s: pose.quat_WL[k : k + 1] for k, s in enumerate(SEGMENTS)})
-    for link, (quat_WL, p_WL) in compute_link_placements(model, q, encoder.links).items():
-        np.testing.assert_allclose(placed[link][:9], Rotation.from_quat(quat_WL[0]).as_matrix().ravel(), atol=1e-6)
-        np.testing.assert_allclose(placed[link][9:], p_WL[0], atol=1e-6)
-    for k, hand in enumerate(("left_palm", "right_palm")):
-        np.testing.assert_allclose(hands[k], pose.points[person.info.points.index(hand)], atol=1e-6)
-    assert {link for link, gone in lost.items() if gone} == {"left_forearm", "left_hand"}  # rigid with its forearm
-
-
-def test_the_n_pose_before_the_start_and_only_what_is_measured_after(model: BodyModel) -> None:
-    encoder = PoseEncoder(model)
-    time_s, placed, hands, lost = unpacked(model, encoder.encode(None))
-    assert math.isnan(time_s)
-    assert np.isnan(hands).all()
-    assert not any(lost.values())
-    for row in placed.values():
-        np.testing.assert_allclose(row[:9], np.eye(3).ravel(), atol=1e-6)
-    one_arm = Person(model, ("torso", "right_upper_arm"))
-    encoder.start(one_arm.info)
-    for frame in (encoder.encode(None), encoder.encode(one_arm.pose(0.3))):
-        placed = unpacked(model, frame)[1]
-        seen = {link for link, row in placed.items() if np.isfinite(row).all()}
-        assert seen == {"torso", "pelvis", "head", "right_upper_arm"}
-        assert all(np.isnan(row).all() for link, row in placed.items() if link not in seen)
-    assert np.isnan(unpacked(model, encoder.encode(one_arm.pose(0.3)))[2]).all()
-
-
-def test_joint_angles_are_those_of_the_poses(model: BodyModel, person: Person) -> None:
-    encoder = PoseEncoder(model)
-    encoder.start(person.info)
-    assert encoder.take_angles() is None
-    poses = [person.pose(0.01 * k) for k in range(60)]
-    for pose in poses:
-        encoder.show(pose)
-    angles = encoder.take_angles()
-    assert angles is not None
-    assert encoder.take_angles() is None
-    chosen = [pose for pose in poses if round(pose.time, 3) in angles["time"]]
-    assert len(chosen) == len(angles["time"]) == 12  # of 100 Hz
-    flexion = [
-        math.degrees((Rotation.from_quat(p.quat_WL[3]).inv() * Rotation.from_quat(p.quat_WL[4])).magnitude())
-        for p in chosen
-    ]
-    np.testing.assert_allclose(angles["joints"]["right_elbow"]["flexion"], flexion, atol=0.06)
-
-
-# The server ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(NO_PROC, reason="reads Linux's /proc")
-def test_nothing_listens_but_on_loopback() -> None:
-    """In a process of its own: other tests' sockets are not this page's."""
-    code = (
-        "import sys\nfrom wepose_pin.live.page import LivePage\nfrom wepose_pin.live.outputs import UdpOutput\n"
-        "from wepose_pin.live.terminal import TerminalView\nfrom wepose_pin.body import load_model\n"
-        "page, out, view = LivePage(load_model()), UdpOutput('127.0.0.1:9'), TerminalView()\n"
-        "page.open()\nprint(page.url, flush=True)\nsys.stdin.read()\npage.close()\nout.close()\n"
-    )
-    run = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert run.stdin is not None
-    assert run.stdout is not None
-    assert run.stdout.readline().startswith("http://127.0.0.1:")
-    # A socket that only sends is 0.0.0.0:0 until it has; ours has not and is not in the table.
-    assert list_listening(run.pid) == {"127.0.0.1"}
-    run.communicate("", timeout=30)
-    assert run.returncode == 0
+def time_of(frame: bytes) -> float:
+    return float(struct.unpack_from("<d", frame)[0])
 
 
 def get(url: str, **headers: str) -> tuple[int, Any, str]:
@@ -199,6 +98,8 @@ def test_the_page_may_do_nothing_but_its_own(page: LivePage) -> None:
     assert all(source.startswith("'sha256-") for source in policy["script-src"].split())
     assert policy["connect-src"] == page.url.replace("http", "ws").rstrip("/")
     assert headers["Cache-Control"] == "no-store"
+    with pytest.raises(OSError):  # nothing listens on another address, loopback or not  # noqa: PT011
+        socket.create_connection(("127.0.0.2", int(page.url.split(":")[2].strip("/"))), timeout=5.0).close()
     for host in ("localhost:8080", "127.0.0.1"):
         code, headers, _ = get(page.url, Host=host)
         assert code == 200
@@ -231,8 +132,8 @@ def talk(page: LivePage, do: Callable[[WebSocketClientConnection], Awaitable[Any
     return asyncio.run(connected())
 
 
-def test_another_address_than_loopback_needs_the_token(model: BodyModel) -> None:
-    with serve(model, host="127.0.0.2") as page:
+def test_another_address_than_loopback_needs_the_token() -> None:
+    with serve(host="127.0.0.2") as page:
         address, _, token = page.url.partition("?token=")
         assert len(token) > 20
         for wrong in ("", "?token=", f"?token={token[:-1]}", f"?other={token}"):
@@ -243,24 +144,19 @@ def test_another_address_than_loopback_needs_the_token(model: BodyModel) -> None
         assert get(f"{address}?token={token}", Origin="http://evil.example")[0] == 403
 
 
-def test_another_body_is_another_page(page: LivePage, model: BodyModel, tmp_path: Path) -> None:
-    robot = load_robot(find_map(str(write_arm(tmp_path))))
-    first = get(page.url)[2]
-
-    async def watch(connection: WebSocketClientConnection) -> None:
-        before = json.loads(await taken(connection))["id"]
-        page.set_body(model, RobotFigure(robot, model, lambda: None))
+def test_another_body_is_another_page(page: LivePage) -> None:
+    async def watch(connection: WebSocketClientConnection) -> list[str]:
+        first = json.loads(await taken(connection))["id"]
+        page.set_body(wp.load_model(lengths={"left_forearm": 0.3}))
         while True:
             message = await taken(connection)
             if isinstance(message, str) and "id" in json.loads(message):
-                assert json.loads(message)["id"] != before
-                return
+                return [first, json.loads(message)["id"]]
 
-    talk(page, watch)
-    second = get(page.url)[2]
-    pattern = r'<script id="wepose-data" type="application/json">(.*?)</script>'
-    links = [json.loads(re.findall(pattern, text, re.DOTALL)[0])["links"] for text in (first, second)]
-    assert [link for link in links[1] if link.startswith("robot ")] == links[1][len(links[0]) :] != []
+    before = get(page.url)[2]
+    first, second = talk(page, watch)
+    assert first != second
+    assert get(page.url)[2] != before
 
 
 async def taken(connection: WebSocketClientConnection) -> Any:
@@ -280,20 +176,20 @@ def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
         connection.close()
 
 
-def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, person: Person, model: BodyModel) -> None:
-    page.start(person.info)
+def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, motion: Person) -> None:
+    page.start(motion.info)
 
     async def slow(connection: WebSocketClientConnection) -> None:
         assert "id" in json.loads(await taken(connection))
-        page.show(person.pose(1.0))
-        while unpacked(model, await taken(connection))[0] != 1.0:
+        page.show(motion.pose(1.0))
+        while time_of(await taken(connection)) != 1.0:
             pass  # the N-pose that was there before
-        page.show(person.pose(2.0))
-        assert unpacked(model, await asyncio.wait_for(connection.read_message(), 60.0))[0] == 2.0
+        page.show(motion.pose(2.0))
+        assert time_of(await asyncio.wait_for(connection.read_message(), 60.0)) == 2.0
         for k in range(200):  # and it does not say that it has drawn that
-            page.show(person.pose(3.0 + k))
+            page.show(motion.pose(3.0 + 0.1 * k))
             if k % 10 == 0:
-                page.status(person.status())
+                page.status(motion.status())
             await asyncio.sleep(0.002)
         waiting = asyncio.ensure_future(connection.read_message())
         assert not (await asyncio.wait([waiting], timeout=0.3))[0]
@@ -301,8 +197,10 @@ def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, pers
         messages = [await asyncio.wait_for(waiting, 60.0)]
         while not isinstance(messages[-1], bytes):
             messages.append(await taken(connection))
-        assert unpacked(model, messages[-1])[0] == 202.0
-        assert [json.loads(message)["state"] for message in messages[:-1]] == ["ready"]
+        assert time_of(messages[-1]) == 3.0 + 0.1 * 199
+        (status,) = (json.loads(message) for message in messages[:-1])
+        assert status["state"] == "ready"
+        assert len(status["angles"]["time"]) == len(status["angles"]["joints"]["right_elbow"]["flexion"]) > 100
 
     talk(page, slow)
 
@@ -325,14 +223,14 @@ def test_keys_and_nonsense(page: LivePage) -> None:
     assert get(page.url)[0] == 200
 
 
-def test_the_end_reaches_the_browser(model: BodyModel, person: Person) -> None:
-    page = LivePage(model)
-    page.start(person.info)
+def test_the_end_reaches_the_browser(motion: Person) -> None:
+    page = LivePage(wp.load_model())
+    page.start(motion.info)
     page.open()
 
     async def wait(connection: WebSocketClientConnection) -> list[Any]:
         messages = [await taken(connection), await taken(connection)]
-        page.status(person.status("ended", "The session has ended."))
+        page.status(motion.status("ended", "The session has ended."))
         closing = asyncio.get_running_loop().run_in_executor(None, page.close)
         while (message := await connection.read_message()) is not None:
             messages.append(message)
@@ -340,23 +238,20 @@ def test_the_end_reaches_the_browser(model: BodyModel, person: Person) -> None:
         return messages
 
     port = int(page.url.split(":")[2].strip("/"))
-    messages = talk(page, wait)
-    assert json.loads(messages[-1])["state"] == "ended"
-    page.close()
-    with serve(model, port=port) as again:  # the port is free at once
+    assert json.loads(talk(page, wait)[-1])["state"] == "ended"
+    with serve(port=port) as again:  # the port is free at once
         assert get(again.url)[0] == 200
 
 
-def test_addresses_that_cannot_be(model: BodyModel, page: LivePage) -> None:
+def test_addresses_that_cannot_be(page: LivePage) -> None:
     port = int(page.url.split(":")[2].strip("/"))
-    with pytest.raises(BadOption, match=rf"cannot listen on 127.0.0.1:{port}: .*in use"):
-        LivePage(model, port=port).open()
-    with pytest.raises(BadOption, match=r"cannot listen on 203\.0\.113\.9:0"):
-        LivePage(model, host="203.0.113.9").open()
-    with pytest.raises(BadOption, match="an address and a port from 1 to 65535"):
-        LivePage(model, host="").open()
-    with pytest.raises(BadOption, match=r"127\.0\.0\.1:99999: an address and a port"):
-        LivePage(model, port=99999).open()
+    for options, says in (
+        ({"port": port}, rf"cannot listen on 127.0.0.1:{port}: .*in use"),
+        ({"host": "203.0.113.9"}, r"cannot listen on 203\.0\.113\.9:0"),
+        ({"host": ""}, "an address and a port from 1 to 65535"),
+    ):
+        with pytest.raises(wp.BadOption, match=says):
+            LivePage(wp.load_model(), **options).open()
 
 
 # In the browser -----------------------------------------------------------------------------------------------------
@@ -398,23 +293,23 @@ def box_of(browser: Browser, element: str) -> dict[str, float]:
     return dict(browser.run(f"document.querySelector('{element}').getBoundingClientRect().toJSON()"))
 
 
-def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Person, browser: Browser) -> None:
-    with serve(model, title="circles") as page:
+def test_the_start_and_the_motion_in_light_and_dark(motion: Person, browser: Browser) -> None:
+    with serve(title="circles") as page:
         browser.errors.clear()
         browser.emulate(prefers_color_scheme="light")
         browser.go(page.url)
-        page.status(person.status("start_pose", "Stand upright and still: 2 s more."))
+        page.status(motion.status("start_pose", "Stand upright and still: 2 s more."))
         browser.wait("window.wepose.state() === 'start_pose' && window.wepose.frames() > 0")
         words = box_of(browser, "#say strong")
         assert words["height"] > 40  # readable from where the person stands
         assert box_of(browser, "#stage")["bottom"] <= box_of(browser, "#say")["top"] + 1  # and hides no arm
-        page.status(person.status("moved", "You moved (torso). Once more."))
+        page.status(motion.status("moved", "You moved (torso). Once more."))
         browser.wait("document.querySelector('#say.moved span')?.textContent.includes('Once more')")
 
         assert browser.run("document.querySelector('#rows tr').innerText").split()[1:3] == ["there", "100"]
-        page.start(person.info)
-        page.status(person.status(lost=("left_forearm",), message="No samples from left forearm."))
-        page.show(person.pose(0.2, lost=("left_forearm",)))
+        page.start(motion.info)
+        page.status(motion.status(lost=("left_forearm",), message="No samples from left forearm."))
+        page.show(motion.pose(0.2, lost=("left_forearm",)))
         browser.wait("window.wepose.time() === 0.2 && window.wepose.state() === 'ready'")
         assert browser.run(NARROW)
         rows = browser.run(
@@ -430,10 +325,10 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         stage, dark = box_of(browser, "#stage canvas"), {"light": False, "dark": True}
         for scheme, is_dark in dark.items():
             browser.emulate(prefers_color_scheme=scheme)
-            page.show(person.pose(2.2 if is_dark else 0.2, lost=("left_forearm",)))
+            page.show(motion.pose(2.2 if is_dark else 0.2, lost=("left_forearm",)))
             browser.wait(f"window.wepose.time() === {2.2 if is_dark else 0.2}")
             before = wait_for_picture(browser, stage, lambda image: (image[-40:, -40:].mean() < 70) == is_dark)  # noqa: B023
-            page.show(person.pose(2.9 if is_dark else 0.9, lost=("left_forearm",)))
+            page.show(motion.pose(2.9 if is_dark else 0.9, lost=("left_forearm",)))
             after = wait_for_picture(browser, stage, lambda image: find_change(before, image).mean() > 0.005)  # noqa: B023
             rows, columns = np.nonzero(find_change(before, after))
             height, width = after.shape[:2]
@@ -447,21 +342,21 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         assert browser.errors == []
 
 
-def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, person: Person, browser: Browser) -> None:
+def test_it_says_that_the_connection_is_lost_and_comes_back(motion: Person, browser: Browser) -> None:
     browser.emulate(prefers_color_scheme="light")
-    page = LivePage(model)
-    page.start(person.info)
+    page = LivePage(wp.load_model())
+    page.start(motion.info)
     page.open()
     port = int(page.url.split(":")[2].strip("/"))
     browser.go(page.url)
-    page.show(person.pose(1.0))
-    page.status(person.status())
+    page.show(motion.pose(1.0))
+    page.status(motion.status())
     browser.wait("window.wepose.time() === 1 && window.wepose.state() === 'ready'")
     page.close()
     assert "Connection lost" in browser.wait("document.querySelector('#offline:not([hidden])')?.textContent")
-    with serve(model, person.info, port=port) as again:
-        again.show(person.pose(2.0))
-        again.status(person.status("ended", "The session has ended."))
+    with serve(motion.info, port=port) as again:
+        again.show(motion.pose(2.0))
+        again.status(motion.status("ended", "The session has ended."))
         browser.wait("window.wepose.time() === 2 && document.querySelector('#offline').hidden")
         browser.wait("window.wepose.state() === 'ended'")
     assert "session has ended" in browser.wait("document.querySelector('#offline:not([hidden])')?.textContent")
