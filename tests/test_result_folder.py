@@ -10,22 +10,18 @@ import numpy as np
 import polars as pl
 import pytest
 
-from wepose_pin.body import load_model
-from wepose_pin.body.subject import population_subject
+from wepose_pin import ExistingOutput, load_model, population_subject, simulate
 from wepose_pin.commands.calibrate import calibrate as calibrate_session
 from wepose_pin.commands.track import track as track_session
-from wepose_pin.errors import ExistingOutput
-from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
-from wepose_pin.writers.provenance import result_folder
 from wepose_pin.writers.result import write_subject
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("session")
-    person = simulate_person(5)
-    write_session(folder, simulate(person.lengths, seed=5, rate_hz=50.0, clasp_s=6.0, circles=0).recording("session"))
+    lengths = population_subject(1.75).lengths
+    write_session(folder, simulate(lengths, seed=5, rate_hz=50.0, clasp_s=6.0, circles=0).recording("session"))
     return folder
 
 
@@ -67,20 +63,11 @@ def test_the_body_of_an_earlier_result_does_not_stay(
     assert "left_thigh" not in load_model(tmp_path / "subject.urdf").table.segments
 
 
-def test_what_a_session_in_the_folder_names_is_the_users(tmp_path: Path) -> None:
-    put_earlier_result(tmp_path, "summary.json")
-    (tmp_path / "session.toml").write_text('model = "model.toml"\n[data]\nfile = "joints.parquet"')
-    before = contents(tmp_path)
-    with result_folder(tmp_path, force=True):
-        pass
-    assert contents(tmp_path) == before
-
-
 @pytest.mark.parametrize("name", ["model.toml", "joints.parquet"])
-def test_a_users_file_is_not_mixed_with_a_result(name: str, tmp_path: Path) -> None:
+def test_a_users_file_is_not_mixed_with_a_result(name: str, session: Path, tmp_path: Path) -> None:
     (tmp_path / name).write_text("mine", encoding="utf-8")
-    with pytest.raises(ExistingOutput, match=f"{name}: is of no earlier result"), result_folder(tmp_path, force=True):
-        pass
+    with pytest.raises(ExistingOutput, match=f"{name}: is of no earlier result"):
+        track(session, tmp_path)
     assert contents(tmp_path) == {name: b"mine"}
 
 

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from commands import run
 from test_export import a_pose, write_folder
 
-from wepose_pin.body.kinematics import find_samples
-from wepose_pin.commands import main
-from wepose_pin.errors import BadData, WrongOption
-from wepose_pin.recording import select_interval
-from wepose_pin.writers.result import read_phases
+import wepose_pin as wp
 
-TIME = 2.0 + np.arange(301) / 100.0
 PHASES = {"start": ((2.0, 2.4),), "reach": ((2.5, 3.0), (3.5, 4.2)), "empty": (), "odd:2": ((4.0, 4.5),)}
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """From 2 to 5 s."""
     folder = write_folder(tmp_path_factory.mktemp("selection") / "result", a_pose())
     (folder / "summary.json").write_text(json.dumps({"recorded_phases": PHASES}), encoding="utf-8")
     return folder
@@ -30,17 +28,20 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("interval", "phase", "selected"),
     [
-        (None, None, None),
+        (None, None, (2.0, 5.0)),
         ((2.5, 3.0), None, (2.5, 3.0)),
-        ((1.99, 5.01), None, (1.99, 5.01)),  # a recording of 5 s whose last sample is at 4.99 has "0 5"
-        (None, "start", (2.0, 2.4)),
+        ((1.99, 5.01), None, (2.0, 5.0)),  # a recording of 5 s whose last sample is at 4.99 has "0 5"
         (None, "start:1", (2.0, 2.4)),
         (None, "reach:2", (3.5, 4.2)),
         (None, "odd:2", (4.0, 4.5)),  # a name may look like a number of another
     ],
 )
-def test_an_interval_or_a_phase_is_selected(interval, phase, selected) -> None:
-    assert select_interval(TIME, PHASES, interval, phase) == selected
+def test_an_interval_or_a_phase_is_selected(interval, phase, selected, result: Path, tmp_path: Path) -> None:
+    wp.export(result, tmp_path / "a.parquet", interval=interval, phase=phase)
+    table, whole = pl.read_parquet(tmp_path / "a.parquet"), pl.read_parquet(result / "pose.parquet")
+    assert table["time"][[0, -1]].to_list() == pytest.approx(selected)
+    kept = (whole["time"] >= selected[0] - 1e-6) & (whole["time"] <= selected[1] + 1e-6)
+    np.testing.assert_allclose(table["right_palm_x"], whole.filter(kept)["right_palm_x"])
 
 
 @pytest.mark.parametrize(
@@ -50,7 +51,7 @@ def test_an_interval_or_a_phase_is_selected(interval, phase, selected) -> None:
         ((2.0, 2.0), None, "the earlier one first"),
         ((0.0, 3.0), None, "--interval 0 3: the recording runs from 2 to 5 s"),
         ((3.0, 7.0), None, "--interval 3 7: the recording runs from 2 to 5 s"),
-        ((3.0, np.inf), None, "the recording runs from 2 to 5 s"),
+        ((2.501, 2.504), None, "the interval 2.501 to 2.504 s has no sample"),
         ((2.0, 3.0), "start", "--interval 2 3: --phase start is given too"),
         (None, "stat", "--phase stat: the recording has no such phase; did you mean 'start'"),
         (None, "empty", "--phase empty: the recording has no such phase"),
@@ -60,50 +61,28 @@ def test_an_interval_or_a_phase_is_selected(interval, phase, selected) -> None:
         (None, "start:2", "--phase start:2: start has one interval; choose start:1"),
     ],
 )
-def test_what_selects_nothing_is_said(interval, phase, said: str) -> None:
-    with pytest.raises(WrongOption) as error:
-        select_interval(TIME, PHASES, interval, phase)
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
+def test_what_selects_nothing_is_said(interval, phase, said: str, result: Path, tmp_path: Path) -> None:
+    with pytest.raises(wp.WeposeError, match=re.escape(said)):
+        wp.export(result, tmp_path / "a.csv", interval=interval, phase=phase)
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_a_recording_without_phases_has_none_to_choose() -> None:
-    with pytest.raises(WrongOption, match="has no phases; use --interval FROM TO"):
-        select_interval(TIME, {}, None, "start")
+@pytest.mark.parametrize("phases", ["{}", "[1]", '{"start": [1, 2], "c": null, "d": [["x", 1]]}'])
+def test_a_recording_without_phases_has_none_to_choose(phases: str, tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "result", a_pose())
+    (folder / "summary.json").write_text(f'{{"recorded_phases": {phases}}}', encoding="utf-8")
+    with pytest.raises(wp.WeposeError, match="has no phases; use --interval FROM TO"):
+        wp.export(folder, tmp_path / "a.csv", phase="start")
 
 
-def test_all_of_a_pose_is_cut() -> None:
-    pose = a_pose()
-    part = pose.cut(find_samples(pose.time, (2.5, 3.0)))
-    assert part.time.tolist() == pose.time[50:101].tolist()
-    for name in ("quat_WL", "points", "segment_cov", "point_cov"):
-        whole = getattr(pose, name)
-        assert {key: values[50:101].tolist() for key, values in whole.items()} == {
-            key: values.tolist() for key, values in getattr(part, name).items()
-        }
-    with pytest.raises(BadData, match=r"the interval 2\.501 to 2\.504 s has no sample"):
-        find_samples(pose.time, (2.501, 2.504))
-
-
-def test_damaged_phases_of_a_summary_are_none() -> None:
-    assert read_phases({"recorded_phases": {"a": [[1, 2]], "b": [1, 2], "c": None, "d": [["x", 1]]}}) == {
-        "a": ((1.0, 2.0),)
-    }
-    assert read_phases({"recorded_phases": [1]}) == {} == read_phases({})
-
-
-def test_each_command_takes_only_what_is_selected(result: Path, tmp_path: Path) -> None:
-    for words, rows in ((["--phase", "reach:2"], 71), (["--interval", "2.5", "3"], 51)):
-        out = tmp_path / f"{rows}.parquet"
-        with pytest.raises(SystemExit) as stop:
-            main(["export", str(result), "-o", str(out), *words])
-        assert stop.value.code == 0
-        assert len(pl.read_parquet(out)) == rows
-        page = tmp_path / f"{rows}.html"
-        with pytest.raises(SystemExit) as stop:
-            main(["view", str(result), "-o", str(page), "--no-open", *words])
-        assert stop.value.code == 0
-        assert page.is_file()
+def test_view_and_evaluate_take_only_what_is_selected(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "a.html"
+    assert run("view", result, "-o", page, "--no-open", "--phase", "reach:2") == 0
+    assert re.search('"begin": ?3.5, ?"end": ?4.2', page.read_text(encoding="utf-8"))
+    assert run("evaluate", result, result / "pose.parquet", "--phase", "reach:1") == 0
+    assert "51 samples from 2.5 to 3 s" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -123,16 +102,7 @@ def test_each_command_takes_only_what_is_selected(result: Path, tmp_path: Path) 
 def test_a_wrong_selection_is_one_line_and_exit_2(
     result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, said: str
 ) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main([word.format(result=result, out=tmp_path) for word in words.split()])
-    assert stop.value.code == 2
+    assert run(*(word.format(result=result, out=tmp_path) for word in words.split())) == 2
     line = capsys.readouterr().err
     assert said in line
     assert line.count("\n") == 1
-
-
-def test_evaluate_counts_only_the_phase(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["evaluate", str(result), str(result / "pose.parquet"), "--phase", "reach:1"])
-    assert stop.value.code == 0
-    assert "51 samples from 2.5 to 3 s" in capsys.readouterr().out
