@@ -22,7 +22,7 @@ ARM = {"right_upper_arm": 0.8, "right_forearm": 1.4}  # [rad], swung to and fro;
 def recorded(
     moved: dict[str, float], *, seconds: float = 6.0, noise: float = 1e-3, sensors: str = "both"
 ) -> wp.Recording:
-    """A person who stands for two seconds and then swings `moved` about the y axis; each sensor's x is up, −z forward."""
+    """A person who stands for two seconds and then swings `moved` about the y axis."""
     rng, time = np.random.default_rng(1), np.arange(round(seconds * 100.0)) / 100.0
     R_LS = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     segments = {
