@@ -550,7 +550,7 @@ def test_a_description_that_is_wrong_is_one_line(change: tuple[str, str], says: 
 @pytest.mark.parametrize(
     ("keys", "says"),
     [
-        ('format = "lab.toml"\ngyro_unit = "deg/s"', r"gyro_unit has no effect, as the format of the file defines it"),
+        ('format = "lab.toml"\n[sensors.torso]\ngyro_unit = "deg/s"', r"gyro_unit has no effect, as the format of the"),
         ('format = "dott"', "did you mean 'dot'"),
         ('format = "mine.toml"', r"mine\.toml: no such file"),
     ],
@@ -558,7 +558,7 @@ def test_a_description_that_is_wrong_is_one_line(change: tuple[str, str], says: 
 def test_keys_beside_a_format(keys: str, says: str, tmp_path: Path) -> None:
     (tmp_path / "lab.toml").write_text(own_format(tmp_path))
     with pytest.raises(wp.WeposeError, match=says):
-        load_file(tmp_path, "walk.csv", data=keys)
+        load_file(tmp_path, "walk.csv", "" if TORSO in keys else TORSO, keys)
 
 
 @pytest.mark.parametrize(
