@@ -25,7 +25,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what editors and type checkers see
+    from .angles import Angles as Angles
     from .angles import joint_angles as joint_angles
+    from .body import BodyModel as BodyModel
     from .body import load_model as load_model
     from .body.kinematics import Pose as Pose
     from .body.subject import Subject as Subject
@@ -54,7 +56,17 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .recording import OrientationSensor as OrientationSensor
     from .recording import Recording as Recording
     from .retargeting import retarget as retarget
+    from .simulation import IDEAL_PRESET as IDEAL_PRESET
+    from .simulation import MILD_PRESET as MILD_PRESET
+    from .simulation import NOISE_FREE as NOISE_FREE
+    from .simulation import PEOPLE_PRESET as PEOPLE_PRESET
+    from .simulation import Imperfections as Imperfections
+    from .simulation import ImuNoise as ImuNoise
+    from .simulation import Person as Person
+    from .simulation import Simulation as Simulation
     from .simulation import simulate as simulate
+    from .simulation import simulate_activity as simulate_activity
+    from .simulation import simulate_person as simulate_person
     from .tracking import TrackResult as TrackResult
     from .tracking import track as track
     from .writers.export import export as export
@@ -62,6 +74,7 @@ if TYPE_CHECKING:  # what editors and type checkers see
 
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
+    "Angles": "angles",
     "BadData": "errors",
     "BadModel": "errors",
     "BadOption": "errors",
@@ -69,15 +82,24 @@ _WHERE = {
     "BadSession": "errors",
     "BadSource": "errors",
     "BadSubject": "errors",
+    "BodyModel": "body",
     "Calibration": "calibration",
     "Diagnostic": "diagnostics",
     "ExistingOutput": "errors",
+    "IDEAL_PRESET": "simulation",
+    "Imperfections": "simulation",
+    "ImuNoise": "simulation",
     "ImuSensor": "recording",
+    "MILD_PRESET": "simulation",
     "MissingFile": "errors",
+    "NOISE_FREE": "simulation",
     "NoSolution": "errors",
     "OrientationSensor": "recording",
+    "PEOPLE_PRESET": "simulation",
+    "Person": "simulation",
     "Pose": "body.kinematics",
     "Recording": "recording",
+    "Simulation": "simulation",
     "StaticTest": "filters.static",
     "Subject": "body.subject",
     "TrackResult": "tracking",
@@ -95,6 +117,8 @@ _WHERE = {
     "population_subject": "body.subject",
     "retarget": "retargeting",
     "simulate": "simulation",
+    "simulate_activity": "simulation",
+    "simulate_person": "simulation",
     "track": "tracking",
 }
 # What the methods of `TrackResult` call in rooms above its own.

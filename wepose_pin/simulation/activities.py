@@ -354,16 +354,27 @@ def simulate_activity(
 
     Parameters
     ----------
-    activity : one of `ACTIVITIES`
+    activity : "walk", "sit", "run", "throw" of the whole body, or "tasks" of the arms
+    seed, rate_hz, noise : as in `simulate`
     imperfections : as in `simulate`. Activities of the whole body leave sway and wrists out; of soft tissue the legs
         have the random part only, and what people hold in the start pose they hold throughout
+    seconds : [s] duration of the activity
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
-    seed, rate_hz, noise : as in `simulate`
+
+    Returns
+    -------
+    Simulation
+        As that of `simulate`.
 
     Raises
     ------
     BadOption, BadModel
         No such activity; too short for it; a length that the body does not have.
+
+    Examples
+    --------
+    >>> wp.simulate_activity("walk", seed=1, seconds=8.0)
+    Simulation(15.0 s at 100 Hz, 15 sensors)
     """
     check_arguments(simulate_activity, locals())
     if activity not in ACTIVITIES:

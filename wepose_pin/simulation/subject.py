@@ -175,10 +175,9 @@ def simulate(
         their own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as
         large
     rate_hz : samples a second
-    noise : of gyroscope and accelerometer; by default that of an Xsens MTi-3, `NOISE_FREE` for none. It and the names
-        in capitals below are in `wepose_pin.simulation`
-    imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject,
-        `PEOPLE_PRESET` for the sizes that the literature reports
+    noise : of gyroscope and accelerometer; by default that of an Xsens MTi-3, `wp.NOISE_FREE` for none
+    imperfections : of subject, mounting and sensors; `wp.IDEAL_PRESET` for none, `wp.MILD_PRESET` for a careful
+        subject, `wp.PEOPLE_PRESET` for the sizes that the literature reports
     clasp_s : [s] duration of the clasp, at least 5
     circles : number of circles, 0 or more
     protocol : what the person does in the time of the clasp: "clasp", "t_pose", "bow", or several joined by "+"
@@ -297,10 +296,29 @@ class Person(NamedTuple):
 
 
 def simulate_person(seed: int, measured_std: float = MEASURED_STD, body: str = DEFAULT_BODY) -> Person:
-    """Sample a person of the population, with the lengths of a `body` and measured shoulder width and trunk.
+    """Draw a person of the population, with shoulder width and trunk as a user would measure them.
 
-    `measured_std` [m] is the error of both: by default that of a careful measurement between the joint centres
-    themselves. Nobody can reach them: `PEOPLE_MEASURED_STD` is the error of 0.83 times the biacromial breadth.
+    Parameters
+    ----------
+    seed : the same seed gives the same person
+    measured_std : [m] error of both measurements: by default that of a careful measurement between the joint centres
+        themselves. Nobody can reach them: `PEOPLE_MEASURED_STD` is the error of 0.83 times the biacromial breadth
+    body : the body whose lengths are drawn: "upper_body" or "whole_body"
+
+    Returns
+    -------
+    Person
+        Its `lengths` are those that `simulate` takes, its `prior` is a subject of that stature and sex.
+
+    Raises
+    ------
+    BadModel
+        No such body.
+
+    Examples
+    --------
+    >>> person = wp.simulate_person(3)
+    >>> simulation = wp.simulate(person.lengths, seed=3, imperfections=wp.MILD_PRESET, clasp_s=10.0)
     """
     rng = np.random.default_rng([seed, 7])
     sex = SEXES[int(rng.integers(2))]
