@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.trials import read_broad
 from benchmarks.validation.single import simulate_paper_dynamic
 from wepose_pin import rotations
-from wepose_pin.errors import BadOption, WeposeWarning
+from wepose_pin.errors import WeposeError, WeposeWarning
 from wepose_pin.evaluation import attitude_error, uncertainty
 from wepose_pin.filters import (
     Amekf,
@@ -210,7 +210,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
 
 def test_wrong_parameters_are_named() -> None:
     for wrong in ({"block_s": 0.0}, {"speed_std": -1.0}, {"gyro_matrix_std": np.nan}):
-        with pytest.raises(BadOption, match=next(iter(wrong))):
+        with pytest.raises(WeposeError, match=next(iter(wrong))):
             AmekfParams(**wrong)
 
 

@@ -26,7 +26,7 @@ from wepose_pin.angles.joints import ISB_AXES
 from wepose_pin.angles.tables import RATE_WINDOW_S
 from wepose_pin.body.kinematics import Pose
 from wepose_pin.diagnostics import render
-from wepose_pin.errors import BadData
+from wepose_pin.errors import WeposeError
 
 ARM = ("upper_arm", "forearm", "hand")
 LEG = ("thigh", "shank", "foot")
@@ -386,7 +386,9 @@ def test_only_joints_with_both_segments_are_there() -> None:
         whole.time, {s: whole.quat_WL[s] for s in ("torso", "left_forearm", "right_upper_arm", "right_forearm")}, {}
     )
     assert list(joint_angles(some).joints) == ["thorax", "right_shoulder", "right_elbow"]
-    with pytest.raises(BadData, match=r"torso, or two segments that one joint connects, are needed; .*: left_forearm$"):
+    with pytest.raises(
+        WeposeError, match=r"torso, or two segments that one joint connects, are needed; .*: left_forearm$"
+    ):
         joint_angles(Pose(whole.time, {"left_forearm": whole.quat_WL["left_forearm"]}, {}))
 
 

@@ -21,7 +21,7 @@ from wepose_pin.body.mounts import compute_start_configuration
 from wepose_pin.body.subject import Subject, load_subject
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
-from wepose_pin.errors import BadSession, BadSubject, WeposeError
+from wepose_pin.errors import WeposeError
 from wepose_pin.live import LivePose, Output, SensorSetup, run_session
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.readers import load_session
@@ -171,11 +171,11 @@ mount = { up = "+z", forward = "+x" }
 @pytest.mark.parametrize(
     ("old", "new", "error", "text"),
     [
-        ("elbow_joint", "elbow_jiont", BadSession, r"joints\.elbow_jiont is no joint .*did you mean 'elbow_joint'"),
-        ("= 0.5", "= 7.0", BadSession, r"joints\.elbow_joint = 7 is outside its limits, -6\.3 to 6\.3"),
-        ("= 0.5", '= "up"', BadSession, r"joints\.elbow_joint = 'up'; a finite number is needed"),
-        ("forearm_link", "forearm", BadSession, r"sensors\.forearm is no link of arm; did you mean 'forearm_link'"),
-        ('"configuration"', '"n_pose"', BadSession, "joints needs start_pose"),
+        ("elbow_joint", "elbow_jiont", WeposeError, r"joints\.elbow_jiont is no joint .*did you mean 'elbow_joint'"),
+        ("= 0.5", "= 7.0", WeposeError, r"joints\.elbow_joint = 7 is outside its limits, -6\.3 to 6\.3"),
+        ("= 0.5", '= "up"', WeposeError, r"joints\.elbow_joint = 'up'; a finite number is needed"),
+        ("forearm_link", "forearm", WeposeError, r"sensors\.forearm is no link of arm; did you mean 'forearm_link'"),
+        ('"configuration"', '"n_pose"', WeposeError, "joints needs start_pose"),
     ],
 )
 def test_what_a_session_of_a_chain_may_not_say(
@@ -193,11 +193,11 @@ def test_what_a_session_of_a_chain_may_not_say(
 
 def test_a_mechanism_and_a_person_are_not_mixed_up(urdf: Path) -> None:
     recording, _ = made(urdf, ["forearm_link"], 6.0)
-    with pytest.raises(BadSession, match=r"sensors\.forearm_link is no segment of upper_body"):
+    with pytest.raises(WeposeError, match=r"sensors\.forearm_link is no segment of upper_body"):
         track(recording)
-    with pytest.raises(BadSession, match="start_pose = 'n_pose' is not known; there is: configuration"):
+    with pytest.raises(WeposeError, match="start_pose = 'n_pose' is not known; there is: configuration"):
         track(replace(recording, start_pose="n_pose", joints={}), model=urdf)
-    with pytest.raises(BadSession, match=r"sensors\.torso is no link of"):
+    with pytest.raises(WeposeError, match=r"sensors\.torso is no link of"):
         track(replace(recording, sensors={"torso": recording.sensors["forearm_link"]}), model=urdf)
 
 
@@ -393,7 +393,7 @@ def test_a_subject_of_a_body_without_lengths(urdf: Path, tmp_path: Path) -> None
     assert again.model.table.is_mechanism
     for name, values in tracked.joints.items():
         np.testing.assert_allclose(again.joints[name], values, atol=1e-6)
-    with pytest.raises(BadSubject, match=r"trunk, shoulder_width.* of the body upper_body is missing"):
+    with pytest.raises(WeposeError, match=r"trunk, shoulder_width.* of the body upper_body is missing"):
         track(replace(recording, sensors={"torso": recording.sensors["forearm_link"]}, start_pose="n_pose"), person)
 
 
@@ -426,7 +426,7 @@ def test_a_person_may_begin_in_another_pose() -> None:
             palm, shoulder = tracked.points[f"{side}_palm"][0], tracked.points[f"{side}_shoulder"][0]
             assert abs((palm - shoulder)[2]) < 0.01
         assert np.degrees(begin["torso"].magnitude()) < 1.0
-    with pytest.raises(BadSession, match=r"joints\.left_upper_arm_x = 9 is outside its limits"):
+    with pytest.raises(WeposeError, match=r"joints\.left_upper_arm_x = 9 is outside its limits"):
         track(replace(recording, start_pose=CONFIGURATION, joints={"left_upper_arm_x": 9.0}))
 
 

@@ -17,7 +17,7 @@ from wepose_pin.body.kinematics import build_pose_table
 from wepose_pin.body.subject import Subject
 from wepose_pin.calibration import calibrate
 from wepose_pin.data_tables import read_table
-from wepose_pin.errors import BadOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.report.track import render_track_report
@@ -95,7 +95,7 @@ def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:
     assert len(list(track_chunks(recording, options=TrackOptions("smoother"), chunk_s=5.0))) == 1
     tracker = Tracker(options=TrackOptions("smoother"))
     tracker.push(recording.cut(slice(0, 2000)))
-    with pytest.raises(BadOption, match="method 'smoother' takes the whole recording as one chunk"):
+    with pytest.raises(WeposeError, match="method 'smoother' takes the whole recording as one chunk"):
         tracker.push(recording.cut(slice(2000, 4000)))
 
 

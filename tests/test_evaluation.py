@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body.kinematics import Pose, build_pose_table, parse_pose_table
-from wepose_pin.errors import BadData
+from wepose_pin.errors import WeposeError
 from wepose_pin.evaluation import evaluate, uncertainty
 
 TIME = np.arange(101) / 10.0
@@ -140,11 +140,11 @@ def test_uncertainty_goes_through_the_table() -> None:
 
 
 def test_nothing_in_common_is_named() -> None:
-    with pytest.raises(BadData, match="no time in common"):
+    with pytest.raises(WeposeError, match="no time in common"):
         evaluate(pose(), replace(pose(), time=TIME + 100.0))
-    with pytest.raises(BadData, match="no time in common within the interval 20 to 30 s"):
+    with pytest.raises(WeposeError, match="no time in common within the interval 20 to 30 s"):
         evaluate(pose(), pose(), (20.0, 30.0))
-    with pytest.raises(BadData, match="no segment and no point in common"):
+    with pytest.raises(WeposeError, match="no segment and no point in common"):
         evaluate(pose(), Pose(TIME, {"head": pose().quat_WL["torso"]}, {}))
 
 

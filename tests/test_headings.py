@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body.links import compute_axis_std, compute_point_covariances
 from wepose_pin.body.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
-from wepose_pin.errors import BadSubject
+from wepose_pin.errors import WeposeError
 from wepose_pin.evaluation import evaluate
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
@@ -202,10 +202,10 @@ def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tm
         np.testing.assert_allclose(again.hinges[joint].axis, hinge.axis, atol=1e-9)
         assert again.hinges[joint].std == pytest.approx(hinge.std, rel=1e-3)
     path.write_text(subject_toml(subject).replace("[hinges.left_elbow]", "[hinges.middle_elbow]"))
-    with pytest.raises(BadSubject, match="hinges: 'middle_elbow' is not known; did you mean"):
+    with pytest.raises(WeposeError, match="hinges: 'middle_elbow' is not known; did you mean"):
         load_subject(path).check_body(TABLE)
     path.write_text(subject_toml(subject).replace("y = 1.0", "y = 0.5"))
-    with pytest.raises(BadSubject, match=r"hinges\.left_elbow\.axis: no unit vector: length 0\.5"):
+    with pytest.raises(WeposeError, match=r"hinges\.left_elbow\.axis: no unit vector: length 0\.5"):
         load_subject(path)
 
 

@@ -19,7 +19,7 @@ from wepose_pin.angles import joint_angles
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import Pose, parse_pose_table
 from wepose_pin.commands.evaluate import evaluate as evaluate_result
-from wepose_pin.errors import BadOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.evaluation import evaluate
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
@@ -149,9 +149,9 @@ def test_running_shakes_the_trunk_and_a_throw_turns_one_upper_arm() -> None:
 
 
 def test_an_activity_that_is_none_or_too_short_is_named() -> None:
-    with pytest.raises(BadOption, match=r"activity 'swim' is not known; .*walk, sit, tasks, run, throw"):
+    with pytest.raises(WeposeError, match=r"activity 'swim' is not known; .*walk, sit, tasks, run, throw"):
         simulate_activity("swim", seed=1)
-    with pytest.raises(BadOption, match="seconds 5: sitting down and standing up once takes 8"):
+    with pytest.raises(WeposeError, match="seconds 5: sitting down and standing up once takes 8"):
         simulate_activity("sit", seed=1, seconds=5.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.errors import BadPhase
+from wepose_pin.errors import WeposeError
 from wepose_pin.filters.noise import ACCEL_FLOOR, GYRO_FLOOR, estimate_noise
 from wepose_pin.filters.phases import WINDOW_S, find_static_window
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
@@ -66,9 +66,9 @@ def test_a_quantised_signal_leaves_invertible_covariances() -> None:
 
 
 def test_too_little_and_weightless_are_named() -> None:
-    with pytest.raises(BadPhase, match="holds 5 samples"):
+    with pytest.raises(WeposeError, match="holds 5 samples"):
         estimate_noise(np.zeros((5, 3)), np.ones((5, 3)), RATE)
-    with pytest.raises(BadPhase, match="no gravity"):
+    with pytest.raises(WeposeError, match="no gravity"):
         estimate_noise(np.zeros((50, 3)), np.zeros((50, 3)), RATE)
 
 

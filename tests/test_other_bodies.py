@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.body import BodyModel, load_model
 from wepose_pin.body.kinematics import Pose, compute_pose
 from wepose_pin.body.table import format_table
-from wepose_pin.errors import BadData, BadOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.evaluation import evaluate
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report.track import render_track_report
@@ -252,7 +252,7 @@ def test_a_robots_tip_lies_where_it_is(robot: BodyModel, tmp_path: Path) -> None
     np.testing.assert_allclose(pose.points["tip"], expected, atol=1e-9)
     tips = measure_tips(pose, 50.0, robot.table)
     np.testing.assert_allclose(tips["tip"].reach, expected - [0.0, 0.0, 0.3], atol=1e-9)  # from its shoulder, along W
-    with pytest.raises(BadData, match="no orientation of a person's upper"):
+    with pytest.raises(WeposeError, match="no orientation of a person's upper"):
         write_bvh(tmp_path / "m.bvh", Motion(pose, robot, "arm", "here"))
     assert '"tip"' in pose_html(robot, pose)
     assert find_floor(robot) == 0.0
@@ -282,7 +282,7 @@ def test_a_robots_joints_are_in_a_mot_and_a_csv(tmp_path: Path) -> None:
     np.testing.assert_allclose(values[:, 1], np.degrees(np.sin(time)), atol=1e-5)
     np.testing.assert_allclose(values[:, 2], np.degrees(0.3), atol=1e-5)
     np.testing.assert_array_equal(values[:, 3], 0.25)
-    with pytest.raises(BadOption, match="--names isb: here is of a mechanism"):
+    with pytest.raises(WeposeError, match="--names isb: here is of a mechanism"):
         write_mot(tmp_path / "m.mot", motion, "isb")
     rows, _ = build_table(motion)
     for name, each in pose.joints.items():

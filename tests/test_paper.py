@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.body.subject import load_subject
 from wepose_pin.calibration import Calibration, assess, calibrate
 from wepose_pin.diagnostics import render
-from wepose_pin.errors import BadOption, NoSolution
+from wepose_pin.errors import WeposeError
 from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, track, track_chunks
@@ -155,7 +155,7 @@ def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulati
     ],
 )
 def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[Person, Simulation, Recording]) -> None:
-    with pytest.raises(BadOption, match=said):
+    with pytest.raises(WeposeError, match=said):
         calibrate(made[2], **({"formulation": "paper"} | options))
 
 
@@ -164,7 +164,7 @@ def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simu
     """Its orientations are relative to the start pose: in the T-pose they would be those of other arms."""
     recording = replace(made[2], start_pose=start_pose)
     expected = f"start_pose = '{start_pose}'; record a start in n_pose, or use --formulation full"
-    with pytest.raises(BadOption, match=re.escape(expected)):
+    with pytest.raises(WeposeError, match=re.escape(expected)):
         calibrate(recording, measured={"shoulder_width": 0.4}, formulation="paper")
 
 
@@ -184,7 +184,7 @@ def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> N
     for k, name in enumerate(simulation.quat_WL):
         angles = k * swing * np.sin((1.0 + 0.3 * k) * since)[:, None] * [0.3, 1.0, 0.0]
         sensors[name] = OrientationSensor(quat_VS=Rotation.from_rotvec(angles).as_quat())
-    with pytest.raises(NoSolution, match=said):
+    with pytest.raises(WeposeError, match=said):
         calibrate(
             replace(simulation.recording("apart"), sensors=sensors),
             measured={"shoulder_width": 0.38},

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.validation.simulated import compute_mount_errors
 from wepose_pin.calibration import Calibration, calibrate
-from wepose_pin.errors import BadSession
+from wepose_pin.errors import WeposeError
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.recording import OrientationSensor, Recording
@@ -120,5 +120,5 @@ def test_without_joined_hands_nobody_knows_which_pose_is_wrong_and_that_is_said(
 def test_a_pose_of_a_segment_without_a_sensor_is_one_line(tmp_path: Path, condition: str) -> None:
     person, simulation = perform("t_pose")
     (tmp_path / "own.toml").write_text(f'{condition}\nphase = "t_pose"\nstd_deg = 4.0\n', encoding="utf-8")
-    with pytest.raises(BadSession, match="no sensor on head, which a pose or an axis is about"):
+    with pytest.raises(WeposeError, match="no sensor on head, which a pose or an axis is about"):
         solve(person, simulation.recording(), str(tmp_path / "own.toml"))

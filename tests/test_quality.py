@@ -18,7 +18,7 @@ from wepose_pin.calibration import Calibration, CalibrationQuality, assess, cali
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import ERROR, from_json, render
-from wepose_pin.errors import BadSubject
+from wepose_pin.errors import WeposeError
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
     MILD_PRESET,
@@ -196,7 +196,7 @@ def test_a_failed_calibration_says_so_and_is_not_tracked(
     assert re.fullmatch(r"Calibration\('simulated': fail; 8 lengths ± \d+ to \d+ mm; first: .+\)", repr(failed))
     assert failed.diagnostics[0] == failed.quality.reasons[0]
     assert "left upper arm and left forearm seem to be exchanged" in failed._repr_html_()
-    with pytest.raises(BadSubject, match="its calibration failed"):
+    with pytest.raises(WeposeError, match="its calibration failed"):
         wp.track(moved, failed)
     assert wp.track(moved, failed, accept_failed=True).subject.quality == "fail"
     assert unmeasured.subject.quality == "poor"

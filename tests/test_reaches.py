@@ -14,7 +14,7 @@ from test_model import GAZEBO, cosmik, example_robot_data_human
 
 from benchmarks.ur5_arm import write_table, write_urdf
 from wepose_pin.body import BodyModel, LinkVector, load_model
-from wepose_pin.errors import BadModel
+from wepose_pin.errors import WeposeError
 
 
 def point_position(lengths: list[float], R_WK: Mapping[str, Rotation], way: Mapping[str, LinkVector]) -> np.ndarray:
@@ -81,5 +81,5 @@ def test_a_joint_that_slides_on_the_way_is_refused(tmp_path: Path) -> None:
     urdf = next(tmp_path.glob("*.urdf"))
     text = urdf.read_text(encoding="utf-8")
     urdf.write_text(text.replace('type="revolute"', 'type="prismatic"', 1), encoding="utf-8")
-    with pytest.raises(BadModel, match=r"joint '\w+' slides: orientations do not tell where \w+ is"):
+    with pytest.raises(WeposeError, match=r"joint '\w+' slides: orientations do not tell where \w+ is"):
         _ = load_model(table).reaches

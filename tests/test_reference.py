@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
 
 from wepose_pin.body.kinematics import Pose, build_pose_table
-from wepose_pin.errors import BadData, WeposeError
+from wepose_pin.errors import WeposeError
 from wepose_pin.evaluation import angle_error, compute_icc, evaluate, register
 from wepose_pin.readers.markers import read_marker_table
 from wepose_pin.readers.reference import Reference, read_reference
@@ -260,17 +260,17 @@ def test_what_is_wrong_in_the_scored_seconds_is_not_fitted_away(pose: Pose, tmp_
 def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
     time, quats, points = in_laboratory(pose)
     still = {name: np.tile(quat[:1], (len(time), 1)) for name, quat in quats.items()}
-    with pytest.raises(BadData, match=r"no offset of the clocks fits .* --time-offset"):
+    with pytest.raises(WeposeError, match=r"no offset of the clocks fits .* --time-offset"):
         register(pose, Pose(time, still, {}))
-    with pytest.raises(BadData, match="no segment in common, whose orientation is needed"):
+    with pytest.raises(WeposeError, match="no segment in common, whose orientation is needed"):
         register(pose, Pose(time, {}, {"left_palm": points["left_palm"]}))
     short = slice(0, 100)
     brief = Pose(pose.time[short], {name: q[short] for name, q in pose.quat_WL.items()}, {})
-    with pytest.raises(BadData, match=r"the pose lasts 2\.0 s; .* 6 s are needed"):
+    with pytest.raises(WeposeError, match=r"the pose lasts 2\.0 s; .* 6 s are needed"):
         register(brief, Pose(time, quats, {}))
     tilted = Rotation.from_rotvec([0.7, 0.0, 0.7])
     leaning = {name: (tilted * Rotation.from_quat(q)).as_quat() for name, q in quats.items()}
-    with pytest.raises(BadData, match=r"no axis of the reference's world is up: .* --fit segments"):
+    with pytest.raises(WeposeError, match=r"no axis of the reference's world is up: .* --fit segments"):
         register(pose, Pose(time, leaning, {}))
 
 

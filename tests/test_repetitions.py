@@ -19,7 +19,7 @@ from wepose_pin.angles.repetitions import (
     find_repetitions,
     normalize_time,
 )
-from wepose_pin.errors import WrongOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.recording import ImuSensor
 
 RATE = 100.0
@@ -211,7 +211,7 @@ def test_a_repetition_in_a_gap_is_left_out() -> None:
 
 
 def test_an_angle_that_is_not_there_is_named() -> None:
-    with pytest.raises(WrongOption, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
+    with pytest.raises(WeposeError, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
         find(reach(2.0), main_angle="right_elbow_flex")
 
 

@@ -138,7 +138,7 @@ def test_a_joint_without_end_moves_and_one_that_is_copied_is_refused(tmp_path: P
     trajectory = retargeting.retarget(person(4.0), endless)
     is_sound(trajectory)
     assert np.median(error(trajectory)) < 5e-3
-    with pytest.raises(errors.BadModel, match="'elbow' is no joint of the arm: it is copied by 'elbow_copy'"):
+    with pytest.raises(errors.WeposeError, match="'elbow' is no joint of the arm: it is copied by 'elbow_copy'"):
         retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path, mimic=True))))
 
 
@@ -245,9 +245,9 @@ def test_uncertain_hands_weigh_less_and_slow_the_robot(arm) -> None:
 def test_an_arm_that_is_never_known_is_refused(arm) -> None:
     pose = person(2.0)
     nowhere = {name: np.full_like(p, np.nan) for name, p in pose.points.items()}
-    with pytest.raises(errors.BadData, match="right arm is not known anywhere"):
+    with pytest.raises(errors.WeposeError, match="right arm is not known anywhere"):
         retargeting.retarget(replace(pose, points=nowhere), arm)
-    with pytest.raises(errors.BadData, match=r"arm's right arm follows right_upper_arm"):
+    with pytest.raises(errors.WeposeError, match=r"arm's right arm follows right_upper_arm"):
         retargeting.retarget(person(2.0, side="left"), arm)
 
 
@@ -283,5 +283,5 @@ def test_the_same_motion_at_another_rate(arm) -> None:
     is_sound(trajectory)
     assert trajectory.time[1] == pytest.approx(0.004)
     assert np.median(error(trajectory)) < 5e-3
-    with pytest.raises(errors.BadOption, match="--rate-hz 5: from 10 to 2000"):
+    with pytest.raises(errors.WeposeError, match="--rate-hz 5: from 10 to 2000"):
         retargeting.retarget(person(), arm, rate_hz=5.0)

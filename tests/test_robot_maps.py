@@ -35,7 +35,7 @@ def load(urdf: Path) -> retargeting.Robot:
     ],
 )
 def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, key: str, text: str) -> None:
-    with pytest.raises(errors.BadModel, match=text):
+    with pytest.raises(errors.WeposeError, match=text):
         load(write_arm(tmp_path, without=key))
 
 
@@ -80,7 +80,7 @@ def test_a_map_needs_the_keys_that_its_table_calls_required(tmp_path: Path, with
     text = "\n".join(lines).replace("SIDE", "right").replace("JOINT", "elbow").replace("LINK", "forearm")
     urdf.with_suffix(".toml").write_text(text)
     if without != "nothing" and REQUIRED[without]:
-        with pytest.raises(errors.BadModel):
+        with pytest.raises(errors.WeposeError):
             retargeting.load_robot(retargeting.read_map(tmp_path / "arm.toml"))
         return
     robot = retargeting.load_robot(retargeting.read_map(tmp_path / "arm.toml"))
@@ -132,14 +132,14 @@ def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text
     said = urdf.with_suffix(".toml").read_text()
     assert old in said
     urdf.with_suffix(".toml").write_text(said.replace(old, new, 1))
-    with pytest.raises(errors.BadModel, match=text):
+    with pytest.raises(errors.WeposeError, match=text):
         load(urdf)
 
 
 @pytest.mark.parametrize(("up", "forward"), [("-z", "+x"), ("+z", "-x"), ("+x", "+y")])
 def test_a_rest_of_another_mount_is_refused(tmp_path: Path, up: str, forward: str) -> None:
     urdf = write_arm(tmp_path, up=up, forward=forward)
-    with pytest.raises(errors.BadModel, match=r"arm.toml: rest: the right hand is .* give a rest for this mount"):
+    with pytest.raises(errors.WeposeError, match=r"arm.toml: rest: the right hand is .* give a rest for this mount"):
         load(urdf)
     text = urdf.with_suffix(".toml").read_text()
     urdf.with_suffix(".toml").write_text(text.replace("[rest]\nelbow = -1.2", ""))
@@ -154,30 +154,33 @@ def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
         return replace(pose, quat_WL=quat, points={n: p for n, p in pose.points.items() if "torso" not in parts})
 
     with pytest.raises(
-        errors.BadData, match="right_forearm, which the sensors do not measure; an arm needs sensors on torso, upper"
+        errors.WeposeError,
+        match="right_forearm, which the sensors do not measure; an arm needs sensors on torso, upper",
     ):
         retargeting.retarget(without("right_forearm"), arm)
-    with pytest.raises(errors.BadData, match="torso, right_shoulder"):
+    with pytest.raises(errors.WeposeError, match="torso, right_shoulder"):
         retargeting.retarget(without("torso"), arm)
     with pytest.raises(
-        errors.BadData, match=r"right arm follows right_.*; an arm needs sensors on torso, upper arm and forearm"
+        errors.WeposeError, match=r"right arm follows right_.*; an arm needs sensors on torso, upper arm and forearm"
     ):
         retargeting.retarget(person(2.0, side="left"), arm)
     has_both = replace(arm.map, arms=arm.map.arms | {"left": arm.map.arms["right"]})  # of which one was selected
-    with pytest.raises(errors.BadData, match=r"arm's right arm follows right_[^;]*; choose arm left$"):
+    with pytest.raises(errors.WeposeError, match=r"arm's right arm follows right_[^;]*; choose arm left$"):
         retargeting.retarget(person(2.0, side="left"), replace(arm, map=has_both))
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
-    with pytest.raises(errors.BadModel, match="--robot pandas: not known; did you mean 'panda'"):
+    with pytest.raises(errors.WeposeError, match="--robot pandas: not known; did you mean 'panda'"):
         retargeting.find_map("pandas")
-    with pytest.raises(errors.BadOption, match=r"--arm left: arm has no left arm; there is: right"):
+    with pytest.raises(errors.WeposeError, match=r"--arm left: arm has no left arm; there is: right"):
         retargeting.load_robot(retargeting.find_map(str(urdf)), ("left",))
     text = urdf.with_suffix(".toml").read_text()
     urdf.with_suffix(".toml").write_text(f"{text}[collision.w1]\nxyz = [0.0, 0.0, 0.1]\n")
-    with pytest.raises(errors.BadModel, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"):
+    with pytest.raises(
+        errors.WeposeError, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"
+    ):
         load(urdf)
     urdf.with_suffix(".toml").unlink()
-    with pytest.raises(errors.MissingFile, match=r"no arm.toml beside it; a robot needs a map"):
+    with pytest.raises(errors.WeposeError, match=r"no arm.toml beside it; a robot needs a map"):
         retargeting.find_map(str(urdf))

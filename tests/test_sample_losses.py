@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wepose_pin.calibration import calibrate
-from wepose_pin.errors import BadPhase
+from wepose_pin.errors import WeposeError
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 
@@ -42,7 +42,7 @@ def test_what_lies_beyond_a_loss_is_not_used(simulation: Simulation) -> None:
 
 def test_a_loss_between_the_start_pose_and_the_motion_is_one_line(simulation: Simulation) -> None:
     with pytest.raises(
-        BadPhase,
+        WeposeError,
         match=r"phases\.clasp has 0\.0 s in which .*; sensors\.left_upper_arm is lost from .* and its heading with it: "
         r"name a start pose and a motion with nothing lost between them, or record again",
     ) as caught:

@@ -13,7 +13,7 @@ from simulated import SUBJECT, within
 from wepose_pin.assets import asset
 from wepose_pin.calibration import assess, calibrate, load_protocol
 from wepose_pin.calibration.protocols import choose_protocol
-from wepose_pin.errors import BadOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.simulation import (
     IDEAL_PRESET,
     MILD_PRESET,
@@ -36,9 +36,9 @@ def test_protocols_join(tmp_path: Path) -> None:
     assert load_protocol(own).steps == load_protocol("clasp").steps
     assert choose_protocol({"start", "clasp"}) == "clasp"
     assert choose_protocol({"start", "clasp", "t_pose"}) == "clasp+t_pose"
-    with pytest.raises(BadOption, match="protocol 't_poes' is not known; did you mean 't_pose'"):
+    with pytest.raises(WeposeError, match="protocol 't_poes' is not known; did you mean 't_pose'"):
         load_protocol("clasp+t_poes")
-    with pytest.raises(BadOption, match=r"protocol 'clasp\+table' is not simulated"):
+    with pytest.raises(WeposeError, match=r"protocol 'clasp\+table' is not simulated"):
         simulate(SUBJECT, seed=3, protocol="clasp+table")
 
 

@@ -11,7 +11,7 @@ from bodies import LENGTHS
 
 from wepose_pin.calibration import calibrate, weights
 from wepose_pin.calibration.least_squares import MIN_LENGTH, Estimate, Gaussian, LeastSquares, solve
-from wepose_pin.errors import NoSolution
+from wepose_pin.errors import WeposeError
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 
 
@@ -74,7 +74,7 @@ def test_a_length_stays_above_its_bound(cases: dict[str, Posed]) -> None:
 
 def test_steps_that_do_not_suffice(cases: dict[str, Posed]) -> None:
     problem, start = cases["any"]
-    with pytest.raises(NoSolution, match=r"the lengths did not converge \(.* standard deviations to go\)"):
+    with pytest.raises(WeposeError, match=r"the lengths did not converge \(.* standard deviations to go\)"):
         solve(problem, start, 1)
     assert solve(problem, start, 1, strict=False).cost < Estimate(problem, start).cost
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.single import simulate_paper_dynamic
-from wepose_pin.errors import BadOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
@@ -177,5 +177,5 @@ def test_the_start_of_a_smooth_motion_is_not_static(rate_hz: float) -> None:
 
 def test_wrong_numbers_of_a_test_are_named() -> None:
     for wrong in ({"window_s": 0.0}, {"alpha": -1.0}, {"rate_stds": np.nan}, {"averaging_s": 0.0}):
-        with pytest.raises(BadOption, match=next(iter(wrong))):
+        with pytest.raises(WeposeError, match=next(iter(wrong))):
             StaticTest(**wrong)

@@ -23,7 +23,7 @@ from wepose_pin.body.subject import (
     population_subject,
     subject_toml,
 )
-from wepose_pin.errors import BadSubject
+from wepose_pin.errors import WeposeError
 
 
 def test_the_average_man_of_de_leva() -> None:
@@ -166,7 +166,7 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, says: str) -> None:
     every = "format = 2\n[lengths]\n" + "\n".join(f"{name} = 0.3" for name in LENGTHS)
     (tmp_path / "subject.toml").write_text(text.replace("ALL", every), encoding="utf-8")
-    with pytest.raises(BadSubject) as caught:
+    with pytest.raises(WeposeError) as caught:
         load_subject(tmp_path).check_body(TABLE)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -14,7 +14,7 @@ from test_model import example_robot_data_human
 from benchmarks.ur5_arm import BENT, SENSED, TABLE
 from wepose_pin.body import BodyModel, load_model
 from wepose_pin.commands import main
-from wepose_pin.errors import BadModel
+from wepose_pin.errors import WeposeError
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.writers import write_session
 
@@ -287,7 +287,7 @@ def check_foreign(
     for name, value in body.lengths.items():
         assert body.with_lengths({name: 1.1 * value}).lengths[name] == pytest.approx(1.1 * value, rel=1e-9)
     if named:
-        with pytest.raises(BadModel) as caught:
+        with pytest.raises(WeposeError) as caught:
             load_model(path)
         assert "\n" not in str(caught.value)
         for part in named:

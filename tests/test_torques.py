@@ -8,7 +8,7 @@ import pytest
 
 from wepose_pin.angles.torques import joint_torques, torque_table
 from wepose_pin.body import load_model
-from wepose_pin.errors import BadData, BadModel, BadOption
+from wepose_pin.errors import WeposeError
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
 
@@ -99,9 +99,9 @@ def test_what_has_no_torques() -> None:
     t = np.arange(100) / RATE
     bare = pin.Model()
     bare.addJoint(0, pin.JointModelRY(), pin.SE3.Identity(), "hinge")
-    with pytest.raises(BadModel, match="no moving link has a mass"):
+    with pytest.raises(WeposeError, match="no moving link has a mass"):
         joint_torques(bare, t, np.zeros((100, 1)))
-    with pytest.raises(BadOption, match="below half the rate, 100 Hz"):
+    with pytest.raises(WeposeError, match="below half the rate, 100 Hz"):
         joint_torques(pendulum(), t, np.zeros((100, 1)), cutoff_hz=120.0)
-    with pytest.raises(BadData, match="at least 11"):
+    with pytest.raises(WeposeError, match="at least 11"):
         joint_torques(pendulum(), t[:5], np.zeros((5, 1)))

@@ -16,7 +16,7 @@ from benchmarks.validation.contenders import list_contenders
 from benchmarks.validation.experiment import Job, Result, run_experiment, summarize
 from benchmarks.validation.page import render_page
 from benchmarks.validation.simulated import MEASURED, PRESETS, calibrate_person, set_exact_mounts, switch_off
-from wepose_pin.errors import BadData, MissingFile
+from wepose_pin.errors import WeposeError
 from wepose_pin.simulation import IDEAL_PRESET, simulate, simulate_person
 
 
@@ -125,7 +125,7 @@ def test_some_experiments_replace_their_part_of_the_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail() -> list[Result]:
-        raise BadData("no trial")
+        raise WeposeError("no trial")
 
     def score(value: float) -> list[Result]:
         return [Result(method, {"drift [deg/min]": value}) for method in ("smekf", "amekf")]
@@ -152,13 +152,13 @@ def test_some_experiments_replace_their_part_of_the_results(
 
 
 def test_trials_that_are_none_are_named(tmp_path: Path) -> None:
-    with pytest.raises(MissingFile, match="neither broad"):
+    with pytest.raises(WeposeError, match="neither broad"):
         list_experiments(data=tmp_path)
     for read in (read_broad, read_authors_trial):
-        with pytest.raises(MissingFile, match="no such file"):
+        with pytest.raises(WeposeError, match="no such file"):
             read(tmp_path / "nothing.mat")
         (tmp_path / "text.mat").write_text("no trial\n")
-        with pytest.raises(BadData):
+        with pytest.raises(WeposeError):
             read(tmp_path / "text.mat")
 
 

@@ -15,7 +15,7 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
-from wepose_pin.errors import BadData
+from wepose_pin.errors import WeposeError
 from wepose_pin.filters import AmekfParams
 from wepose_pin.retargeting import ControllerParams
 from wepose_pin.simulation import Imperfections, ImuNoise
@@ -245,7 +245,7 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
     rng = np.random.default_rng(0)
     gyro, accel = rng.normal(scale=1e-3, size=(900, 3)), rng.normal(scale=1e-2, size=(900, 3)) + [0.0, 0.0, 9.81]
     for wrong, match in (((1e200 * gyro, accel), r"^gyro_S .* rad/s"), ((gyro, 1e3 * accel), r"^accel_S .* m/s\^2")):
-        with pytest.raises(BadData, match=match):
+        with pytest.raises(WeposeError, match=match):
             wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
 
 
@@ -259,10 +259,10 @@ def test_a_pose_or_a_truth_of_nan_is_refused() -> None:
     pose = right()["evaluate"]["pose"]
     quats, points = ({n: np.full_like(v, NAN) for n, v in each.items()} for each in (pose.quat_WL, pose.points))
     unknown = replace(pose, quat_WL=quats, points=points)
-    with pytest.raises(BadData, match="NaN in all samples"):
+    with pytest.raises(WeposeError, match="NaN in all samples"):
         wp.joint_angles(unknown)
     for pair in ((pose, unknown), (unknown, pose)):
-        with pytest.raises(BadData, match=r"no orientation of a segment is known to both at a time: of .* NaN"):
+        with pytest.raises(WeposeError, match=r"no orientation of a segment is known to both at a time: of .* NaN"):
             wp.evaluate(*pair)
-    with pytest.raises(BadData, match=r"no position of a point is known to both at a time: of .* NaN"):
+    with pytest.raises(WeposeError, match=r"no position of a point is known to both at a time: of .* NaN"):
         wp.evaluate(pose, replace(pose, points=points))
