@@ -1,11 +1,10 @@
-"""`wepose angles`: low-pass, stated uncertainty of ranges and rates, comparison, tables, figures, page."""
+"""`wepose angles`: low-pass, stated uncertainty of ranges, comparison, tables, figures, page."""
 
 from __future__ import annotations
 
 import json
 import re
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,24 +14,11 @@ from commands import run
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_ind
-from test_export import LENGTHS, write_folder
+from test_export import write_folder
 
-from wepose_pin.angles import SHOULDER_SEQUENCES, group_sides, joint_angles
-from wepose_pin.angles.joints import JOINTS, describe_joint
-from wepose_pin.angles.movement import (
-    MovementOptions,
-    analyze_movement,
-    build_comparison_table,
-    compute_interval,
-    smooth_pose,
-)
-from wepose_pin.angles.tables import compute_summary_std, summarize_joint
-from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import Pose, compute_pose
-from wepose_pin.report.angles import draw_figures
+from wepose_pin import Pose, joint_angles
 
 RATE = 100.0
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def bend(n: int, seed: int, most_deg: float = 90.0, seconds: float = 2.0) -> np.ndarray:
@@ -55,11 +41,10 @@ def pose_of(seed: int, most_deg: float = 90.0, n: int = 1401) -> Pose:
     forearm = upper_arm * about("y", -bend(n, seed, most_deg))
     rotations = {"torso": upright, "right_upper_arm": upper_arm, "right_forearm": forearm}
     quat_WL = {name: rotation.as_quat() for name, rotation in rotations.items()}
-    pose = compute_pose(load_model(lengths=LENGTHS), np.arange(n) / RATE, quat_WL)
     rng = np.random.default_rng(9)
     factors = {name: rng.normal(0.0, 0.02, (3, 3)) for name in quat_WL}
     cov = {name: np.broadcast_to(factor @ factor.T, (n, 3, 3)).copy() for name, factor in factors.items()}
-    return replace(pose, segment_cov=cov)
+    return Pose(np.arange(n) / RATE, quat_WL, {}, segment_cov=cov)
 
 
 PHASES = {"start": [[0.0, 1.0]], "bend": [[2.0, 4.0], [4.0, 6.0], [6.0, 8.0]]}
@@ -77,43 +62,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folders[0], folders[1]
 
 
-# The low-pass -----------------------------------------------------------------------------------------------------
-
-
-def pose_about(angle: np.ndarray, segment: str = "torso") -> Pose:
-    return Pose(np.arange(len(angle)) / RATE, {segment: Rotation.from_rotvec(np.outer(angle, [0, 0, 1])).as_quat()}, {})
-
-
-def angle_about(pose: Pose) -> np.ndarray:
-    return np.unwrap(2.0 * np.arctan2(pose.quat_WL["torso"][:, 2], pose.quat_WL["torso"][:, 3]))
-
-
-def test_the_low_pass_is_that_of_the_angle_also_through_full_turns() -> None:
-    t = np.arange(1000) / RATE
-    angle = 1.2 * t + 0.2 * np.sin(2 * np.pi * 1.0 * t) + 0.02 * np.sin(2 * np.pi * 15.0 * t)
-    smooth = angle_about(smooth_pose(pose_about(angle), 5.0))
-    expected = sosfiltfilt(butter(2, 5.0, fs=RATE, output="sos"), angle)
-    turns = 2.0 * np.pi * np.round((smooth[0] - expected[0]) / (2.0 * np.pi))
-    np.testing.assert_allclose((smooth - turns)[50:-50], expected[50:-50], atol=2e-4)
-
-
-def test_the_low_pass_keeps_what_is_not_known_and_stops_at_a_gap_in_time() -> None:
-    angle = np.where(np.arange(400) < 200, 0.0, 1.0)
-    pose = pose_about(angle)
-    pose.quat_WL["torso"][100:110] = np.nan
-    jump = replace(pose, time=np.where(np.arange(400) < 200, pose.time, pose.time + 1.0))
-    smooth = smooth_pose(jump, 5.0).quat_WL["torso"]
-    assert np.flatnonzero(np.isnan(smooth).any(axis=1)).tolist() == list(range(100, 110))
-    known = np.isfinite(smooth).all(axis=1)
-    np.testing.assert_allclose(smooth[known], pose.quat_WL["torso"][known], atol=1e-9)
-    assert np.abs(smooth_pose(pose, 5.0).quat_WL["torso"][199, 2]) > 0.1  # without the gap the step is smoothed
-
-
-# What the pose states ---------------------------------------------------------------------------------------------
+def read_tables(folder: Path) -> dict[str, pl.DataFrame]:
+    return {path.stem: pl.read_csv(path) for path in folder.glob("*.csv")}
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_ranges_and_rates_are_as_uncertain_as_drawn_errors_make_them(side: str) -> None:
+def test_ranges_are_as_uncertain_as_drawn_errors_make_them(side: str, tmp_path: Path) -> None:
     """Errors of each segment, constant in W or in the segment: the larger spread of the two is stated."""
     rng = np.random.default_rng(5)
     n, draws = 60, 3000
@@ -125,54 +79,23 @@ def test_ranges_and_rates_are_as_uncertain_as_drawn_errors_make_them(side: str) 
     factors = {name: rng.normal(0.0, 0.01, (3, 3)) for name in names}
     cov = {name: np.broadcast_to(factor @ factor.T, (n, 3, 3)).copy() for name, factor in factors.items()}
     pose = Pose(time, {name: R.as_quat() for name, R in rotations.items()}, {}, segment_cov=cov)
-    joint = joint_angles(pose)[f"{side}_elbow"]
-    summary = summarize_joint(time, joint)
-    stated = compute_summary_std(pose, f"{side}_elbow", joint, summary.samples[None])[0]
-    low, high, begin, end = summary.samples[0]
-    spreads = []
+    assert run("angles", write_folder(tmp_path / "result", pose), "-o", tmp_path / "angles") == 0
+    row = (pl.col("joint") == f"{side}_elbow") & (pl.col("angle") == "flexion") & (pl.col("phase") == "all")
+    [stated] = read_tables(tmp_path / "angles")["phases"].filter(row)["range_std_deg"]
+    flexion = joint_angles(pose)[f"{side}_elbow"]["flexion"]
+    ends, spreads = (int(flexion.argmax()), int(flexion.argmin())), []
     for constant in ("W", "L"):
-        errors = {
-            name: Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name][0], draws)) for name in names
-        }
-
-        def draw(sample: int, constant: str = constant, errors: dict[str, Rotation] = errors) -> np.ndarray:
+        errors = {n: Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[n][0], draws)) for n in names}
+        drawn = []
+        for sample in ends:
             quat_WL = {}
             for name, R in rotations.items():
                 # The error of the middle of the movement, as it is in W, or as it is in the segment.
                 error = errors[name] if constant == "W" else R[n // 2].inv() * errors[name] * R[n // 2]
                 quat_WL[name] = (error * R[sample] if constant == "W" else R[sample] * error).as_quat()
-            return joint_angles(Pose(np.arange(draws) / RATE, quat_WL, {}))[f"{side}_elbow"].values[:, 0]
-
-        rate = (draw(end) - draw(begin)) / (time[end] - time[begin])
-        spreads.append([np.std(draw(high) - draw(low)), np.std(rate)])
-    range_std, rate_std = np.max(spreads, axis=0)
-    assert stated[0, 2] == pytest.approx(range_std, rel=0.1)
-    assert stated[0, 3] == pytest.approx(rate_std, rel=0.1)
-    assert np.array_equal(stated[:, 0], [joint.std[s, k] for k, s in enumerate(summary.samples[:, 0])])
-
-
-# Comparison -------------------------------------------------------------------------------------------------------
-
-
-def test_the_interval_of_a_difference_is_welchs() -> None:
-    rng = np.random.default_rng(7)
-    first, second = rng.normal(60.0, 3.0, 8), rng.normal(63.0, 6.0, 13)
-    one, two = ((len(values), values.mean(), values.std(ddof=1)) for values in (first, second))
-    interval = ttest_ind(second, first, equal_var=False).confidence_interval(0.95)
-    assert compute_interval(one, two) == pytest.approx(tuple(interval), rel=1e-9)
-    assert np.isnan(compute_interval(one, (1, 5.0, float("nan")))).all()
-
-
-def test_sessions_are_compared_after_the_full_turns_between_them() -> None:
-    first = analyze_movement("a", pose_of(1), {}, MovementOptions())
-    turned = (pl.col("joint") == "right_elbow").cast(float) * 360.0
-    measures = first.measures.with_columns(pl.col("lowest_deg") + turned, pl.col("highest_deg") + turned)
-    table = build_comparison_table([first, replace(first, name="b", measures=measures)])
-    known = table.filter(pl.col("difference").is_finite())
-    assert "right_elbow" in known["joint"]
-    np.testing.assert_allclose(known["difference"].to_numpy(), 0.0, atol=1e-9)
-    stated = known["difference_std"].drop_nans()
-    assert len(stated)
+            drawn.append(joint_angles(Pose(np.arange(draws) / RATE, quat_WL, {}))[f"{side}_elbow"]["flexion"])
+        spreads.append(np.std(drawn[0] - drawn[1]))
+    assert stated == pytest.approx(np.degrees(max(spreads)), rel=0.1)
 
 
 # The command ------------------------------------------------------------------------------------------------------
@@ -186,7 +109,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     printed = capsys.readouterr().out
     assert re.search(r"before .* right elbow flexion rising +7 .* 1\.00", printed)
     assert "low-passed at 6 Hz" in printed
-    tables = {path.stem: pl.read_csv(path) for path in out.glob("*.csv")}
+    tables = read_tables(out)
     assert set(tables) == {
         *("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison", "definitions"),
     }
@@ -204,13 +127,19 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert compared["difference"] == pytest.approx(
         summary["range_mean_deg"][1] - summary["range_mean_deg"][0], abs=1e-3
     )
-    assert compared["ci95_low"] < compared["difference"] < compared["ci95_high"] < 0.0
+    before, after = (
+        tables["repetitions"].filter(elbow & (pl.col("session") == name))["range_deg"] for name in ("before", "after")
+    )
+    welch = ttest_ind(after, before, equal_var=False).confidence_interval(0.95)
+    assert (compared["ci95_low"], compared["ci95_high"]) == pytest.approx(tuple(welch), abs=1e-2)
+    assert compared["difference"] < 0.0
     curve = tables["curves"].filter(elbow & (pl.col("session") == "after"))
     assert curve["percent"].to_list() == list(range(101))
     assert curve["mean_deg"].max() == pytest.approx(70.0, abs=4.0)
     over_time = tables["angles"].filter(pl.col("session") == "before")
     assert over_time.height == 1401
-    assert over_time["right_elbow_flexion_deg"].max() == pytest.approx(true.max(), abs=0.3)
+    low_passed = sosfiltfilt(butter(2, 6.0, fs=RATE, output="sos"), np.degrees(bend(1401, 1)))
+    np.testing.assert_allclose(over_time["right_elbow_flexion_deg"].to_numpy(), low_passed, atol=0.05)
     phases = tables["phases"].filter(elbow & (pl.col("session") == "before"))
     assert phases["phase"].to_list() == ["all", "start", "bend", "bend", "bend"]
     assert phases["highest_deg"][2] == pytest.approx(true[1], abs=0.3)
@@ -271,28 +200,3 @@ def test_a_mistake_is_one_line_and_exit_2(
     assert said in line
     assert line.count("\n") == 1
     assert not (tmp_path / "a").exists()
-
-
-def test_curves_have_a_line_a_session_and_their_number_of_repetitions() -> None:
-    movements = [analyze_movement(name, pose_of(seed), {}, MovementOptions()) for name, seed in (("a", 1), ("b", 2))]
-    figures = draw_figures(movements)
-    assert list(figures) == [
-        *("repetitions", "curves-thorax", "curves-shoulder", "curves-elbow", "angles-1", "angles-2")
-    ]
-    panels = {ax.get_title("left"): ax for ax in figures["curves-elbow"].axes}
-    assert [line.get_label() for line in panels["right elbow: flexion [°]"].lines] == ["a, n = 7", "b, n = 7"]
-    alone = {ax.get_title("left"): ax for ax in draw_figures(movements[:1])["curves-elbow"].axes}
-    assert len(alone["right elbow: flexion [°]"].lines) == 1 + 7  # and each repetition
-
-
-# Definitions ------------------------------------------------------------------------------------------------------
-
-
-def test_each_angle_is_defined_as_the_page_has_it() -> None:
-    """The words of the tables are those of docs/angles.md."""
-    page = (ROOT / "docs" / "angles.md").read_text(encoding="utf-8").replace("**", "")
-    for group, sides in group_sides(JOINTS).items():
-        joint = next(iter(sides.values()))
-        for name, positive in (JOINTS[joint].angles or SHOULDER_SEQUENCES["YXY"]).items():
-            assert f"| `{name}` | {positive} |" in page, (group, name)
-        assert f" | {describe_joint(joint)} | " in page

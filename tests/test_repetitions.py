@@ -7,46 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin.angles import JOINTS, Angles, JointAngles, joint_angles
-from wepose_pin.angles.repetitions import (
-    Repetitions,
-    compute_cmc,
-    compute_mean_curves,
-    find_main_angle,
-    find_movements,
-    find_repetitions,
-    normalize_time,
-)
-from wepose_pin.errors import WeposeError
-from wepose_pin.recording import ImuSensor
+from wepose_pin.angles.repetitions import Repetitions, compute_cmc, find_movements, find_repetitions
 
 RATE = 100.0
 FLEXION = "right_elbow_flexion"
 
 
-def angles_of(flexion_deg: np.ndarray, rate_hz: float = RATE, **joints: np.ndarray) -> Angles:
-    """Angles over time: the first of the right elbow, and of other joints (n, 3) [deg]."""
-    n = len(flexion_deg)
-    values = {"right_elbow": np.column_stack([flexion_deg, np.zeros(n), np.full(n, 90.0)]), **joints}
-    never = np.zeros(n, dtype=bool)
-    return Angles(
-        np.arange(n) / rate_hz,
-        {
-            name: JointAngles(
-                "ZXY",
-                tuple(JOINTS[name].angles),
-                np.radians(each),
-                np.ones(n),
-                never.copy(),
-                never.copy(),
-                None,
-                np.zeros((n, 4)),
-            )
-            for name, each in values.items()
-        },
-    )
+def angles_of(flexion_deg: np.ndarray, rate_hz: float = RATE) -> wp.Angles:
+    """Angles of a right arm whose elbow bends so."""
+    upper = np.tile([0.0, 0.0, 0.0, 1.0], (len(flexion_deg), 1))
+    forearm = Rotation.from_euler("y", -flexion_deg[:, None], degrees=True).as_quat()
+    time = np.arange(len(flexion_deg)) / rate_hz
+    return wp.joint_angles(wp.Pose(time, {"right_upper_arm": upper, "right_forearm": forearm}, {}))
 
 
 def reach(seconds: float, low: float = 10.0, high: float = 90.0, rate_hz: float = RATE) -> np.ndarray:
@@ -103,13 +78,6 @@ def test_half_repetitions_at_the_ends_are_left_out() -> None:
     check_spans(repetitions, spans[1:-1] - 0.4)
 
 
-def test_a_stop_on_the_way_is_part_of_a_repetition() -> None:
-    half = reach(2.0)[:100]
-    there = np.concatenate([half[:50], rest(0.8, half[50]), half[50:], half[::-1]])
-    signal, spans = chain(rest(1.0), *[part for _ in range(4) for part in (there, rest(1.0))])
-    check_spans(find(signal), spans)
-
-
 def test_an_angle_that_rests_high_falls_first() -> None:
     signal, spans = chain(*[part for _ in range(5) for part in (rest(1.0), reach(1.5))], rest(1.0))
     for turned in (-signal, 100.0 - signal):
@@ -158,14 +126,14 @@ def test_where_nothing_repeats_it_says_so(signal: np.ndarray, said: str) -> None
 
 def test_a_motion_at_random_is_hardly_ever_taken_for_repetitions() -> None:
     taken = 0
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         sos = butter(2, rng.uniform(0.1, 1.0), fs=RATE, output="sos")
         signal = sosfiltfilt(sos, rng.normal(size=6000))
         repetitions = find(40.0 * signal / signal.std())
         taken += not repetitions.reason
         assert repetitions.reason or repetitions.cmc >= 0.85
-    assert taken <= 2
+    assert taken <= 1
 
 
 def test_the_rate_of_sampling_does_not_matter() -> None:
@@ -181,22 +149,16 @@ def test_the_rate_of_sampling_does_not_matter() -> None:
 # The main angle ---------------------------------------------------------------------------------------------------
 
 
-def test_the_main_angle_is_that_of_the_largest_range_between_segments() -> None:
-    n = 1000
-    wave = np.sin(np.linspace(0.0, 20.0, n))
-    large, small = np.column_stack([10.0 * wave, 50.0 * wave, 0.0 * wave]), np.outer(wave, np.ones(3))
-    angles = angles_of(20.0 * wave, thorax=9.0 * large, right_wrist=large, left_wrist=small)
-    assert find_main_angle(angles) == "right_wrist_ulnar_deviation"
-    angles.joints["right_wrist"].gap[:100] = True
-    assert find_main_angle(angles) == "right_wrist_ulnar_deviation"
-    angles.joints["right_wrist"].gap[:300] = True
-    assert find_main_angle(angles) == FLEXION
-    angles = angles_of(20.0 * wave)
-    angles.joints["right_elbow"].near_lock[:] = True  # leaves the second angle
-    assert find_main_angle(angles) == "right_elbow_carrying_angle"
-    angles.joints["right_elbow"].gap[:] = True
-    assert find_main_angle(angles) is None
-    assert find_repetitions(angles).reason.startswith("each angle is near gimbal lock for over 1 % of the time")
+def test_the_main_angle_is_that_of_the_largest_range_that_is_known() -> None:
+    wave = np.sin(np.linspace(0.0, 20.0, 1000))
+    bent = {"left_forearm": 50.0 * wave, "right_forearm": 20.0 * wave}
+    quat_WL = {s: Rotation.from_euler("y", -angle[:, None], degrees=True).as_quat() for s, angle in bent.items()}
+    quat_WL |= dict.fromkeys(("left_upper_arm", "right_upper_arm"), np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1)))
+    angles = wp.joint_angles(wp.Pose(np.arange(1000) / RATE, quat_WL, {}))
+    assert find_repetitions(angles).source == "left_elbow_flexion"
+    angles["left_elbow"].gap[:300] = True
+    assert find_repetitions(angles).source == FLEXION
+    angles["right_elbow"].gap[:] = True
     assert "not determined for even 10 samples" in find_repetitions(angles, FLEXION).reason
 
 
@@ -211,52 +173,8 @@ def test_a_repetition_in_a_gap_is_left_out() -> None:
 
 
 def test_an_angle_that_is_not_there_is_named() -> None:
-    with pytest.raises(WeposeError, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
+    with pytest.raises(wp.WeposeError, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
         find(reach(2.0), main_angle="right_elbow_flex")
-
-
-# Curves -----------------------------------------------------------------------------------------------------------
-
-
-def test_curves_are_those_of_the_repetitions() -> None:
-    signal, spans = chain(rest(1.0), reach(2.0), reach(3.0), reach(1.0, 12.0, 92.0), rest(1.0))
-    angles = angles_of(signal)
-    curves = normalize_time(angles.time, np.degrees(angles["right_elbow"].values), spans)
-    for row, low in zip(curves[:, :, 0], (10.0, 10.0, 12.0), strict=True):
-        np.testing.assert_allclose(
-            row[:-1], low + 40.0 * (1.0 - np.cos(2.0 * np.pi * np.arange(100) / 100.0)), atol=0.3
-        )
-    mean = compute_mean_curves(angles, spans)["right_elbow"][0]
-    np.testing.assert_allclose(np.degrees(mean.mean), curves[:, :, 0].mean(axis=0), atol=1e-9)
-    np.testing.assert_allclose(np.degrees(mean.sd), curves[:, :, 0].std(axis=0, ddof=1), atol=1e-9)
-    assert mean.n.tolist() == [3] * 101
-
-
-def test_what_is_not_determined_breaks_a_curve() -> None:
-    signal, spans = chain(rest(1.0), *[reach(2.0)] * 4, rest(1.0))
-    angles = angles_of(signal)
-    angles.joints["right_elbow"].near_lock[100:150] = True  # the first quarter of one of four
-    angles.joints["right_elbow"].gap[300:310] = True
-    first, second, _ = compute_mean_curves(angles, spans)["right_elbow"]
-    assert first.n[12] == second.n[12] - 1 == 3
-    assert np.isfinite(first.mean).all()
-    for begin in (300, 500):
-        angles.joints["right_elbow"].near_lock[begin : begin + 50] = True
-    first, second, _ = compute_mean_curves(angles, spans)["right_elbow"]
-    assert np.isnan(first.mean[5:20]).all()
-    assert np.isfinite(first.mean[30:]).all()
-    assert np.isfinite(second.mean[12:]).all()
-
-
-@pytest.mark.parametrize("turn", [360.0, -720.0])
-def test_curves_are_within_half_a_turn_of_zero(turn: float) -> None:
-    """Angles are continuous: an arm that circled about the lock hangs a full turn later."""
-    signal, spans = chain(rest(1.0), *[reach(2.0)] * 4, rest(1.0))
-    angles, plain = angles_of(signal + turn), angles_of(signal)
-    for moved, stayed in zip(
-        compute_mean_curves(angles, spans)["right_elbow"], compute_mean_curves(plain, spans)["right_elbow"], strict=True
-    ):
-        np.testing.assert_allclose(moved.mean, stayed.mean, atol=1e-9)
 
 
 def test_the_cmc_is_kadabas() -> None:
@@ -266,8 +184,6 @@ def test_the_cmc_is_kadabas() -> None:
     total = sum((curves[i, t] - curves.mean()) ** 2 for i in range(7) for t in range(50)) / (7 * 50 - 1)
     assert compute_cmc(curves) == pytest.approx(np.sqrt(1.0 - within / total), abs=1e-12)
     assert compute_cmc(np.tile(curves[0], (3, 1))) == 1.0
-    assert compute_cmc(rng.normal(size=(5, 50)) + np.arange(5.0)[:, None]) == 0.0
-    assert np.isnan(compute_cmc(curves[:1]))
 
 
 # People -----------------------------------------------------------------------------------------------------------
@@ -277,10 +193,10 @@ def test_the_arm_swings_of_a_real_walk_are_found(data: Path) -> None:
     """A person works at a table, stands up and walks; the period of the swing is the raw gyroscope's."""
     recording = wp.load_session(data / "upper_body" / "session.toml")
     pose = wp.track(recording, method="amekf", open_loop=True).pose
-    repetitions = find_repetitions(joint_angles(pose, "XZY"), "left_shoulder_flexion")
+    repetitions = find_repetitions(wp.joint_angles(pose, "XZY"), "left_shoulder_flexion")
     walk = (recording.time > 97.0) & (recording.time < 137.0)
     sensor = recording.sensors["left_upper_arm"]
-    assert isinstance(sensor, ImuSensor)
+    assert isinstance(sensor, wp.ImuSensor)
     swing = sensor.gyro_S[walk, np.argmax(sensor.gyro_S[walk].std(axis=0))]
     spectrum = np.abs(np.fft.rfft((swing - swing.mean()) * np.hanning(len(swing)), 16 * len(swing)))
     period = 1.0 / np.fft.rfftfreq(16 * len(swing), 1.0 / recording.rate_hz)[spectrum.argmax()]
