@@ -12,9 +12,7 @@ import pytest
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body import BodyModel, convert_breadths, load_model, load_table
-from wepose_pin.diagnostics import render
-from wepose_pin.errors import WeposeError
+from wepose_pin import BodyModel, WeposeError, load_model
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
 SEGMENTS = ["torso", "pelvis", "head"] + [
@@ -110,10 +108,6 @@ def largest_difference(text: str, body: BodyModel, seed: int = 0, n: int = 10) -
     return worst, links
 
 
-def xml_mass(text: str) -> float:
-    return sum(float(m.get("value")) for m in ET.fromstring(text.encode()).iter("mass"))
-
-
 # Ours -------------------------------------------------------------------------------------------------------------
 
 
@@ -137,7 +131,8 @@ def test_it_moves_as_pinocchios_own_model_does(urdf: Path) -> None:
 def test_mass_and_centre_of_mass_are_kept(urdf: Path) -> None:
     text = urdf.read_text(encoding="utf-8")
     body = load_model(urdf)
-    assert sum(inertia.mass for inertia in body.pin.inertias) == pytest.approx(xml_mass(text), rel=1e-12)
+    mass = sum(float(m.get("value")) for m in ET.fromstring(text.encode()).iter("mass"))
+    assert sum(inertia.mass for inertia in body.pin.inertias) == pytest.approx(mass, rel=1e-12)
     raw, q_raw, q = configurations(text, body, np.random.default_rng(1))
     root = link_placements(body.pin, q)
     of_root = root.get(raw.frames[1].name, root.get(f"{raw.frames[1].name}_link"))
@@ -145,23 +140,25 @@ def test_mass_and_centre_of_mass_are_kept(urdf: Path) -> None:
     np.testing.assert_allclose(pin.centerOfMass(body.pin, body.pin.createData(), q), com, atol=1e-12)
 
 
-def test_joints_stand_depth_first_as_the_mass_matrix_needs(urdf: Path) -> None:
-    model = load_model(urdf).pin
-    q = pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
-    v = np.random.default_rng(2).normal(size=model.nv)
-    M = pin.crba(model, model.createData(), q)
-    M = np.triu(M) + np.triu(M, 1).T
-    assert 0.5 * v @ M @ v == pytest.approx(pin.computeKineticEnergy(model, model.createData(), q, v), rel=1e-10)
-
-
-def test_limits_of_single_joints_are_the_urdfs(urdf: Path) -> None:
-    body = load_model(urdf)
-    joints = {joint.get("name"): joint for joint in ET.parse(urdf).getroot().findall("joint")}
-    for k, name in enumerate(body.pin.names):
-        if body.pin.nqs[k] == 1:
-            first = body.pin.idx_qs[k]
-            assert body.pin.lowerPositionLimit[first] == float(joints[name].find("limit").get("lower"))
-            assert body.pin.upperPositionLimit[first] == float(joints[name].find("limit").get("upper"))
+def test_every_point_is_an_affine_function_of_the_lengths(urdf: Path) -> None:
+    """By which calibration and headings know where points are: against Pinocchio, for any lengths and orientations."""
+    rng, body = np.random.default_rng(0), load_model(urdf)
+    assert set(body.reaches) == set(body.point_frames)
+    body = body.with_lengths({name: value * rng.uniform(0.7, 1.3) for name, value in body.lengths.items()})
+    m, data = body.pin, body.pin.createData()
+    low, high = (np.clip(limit, -np.pi, np.pi) for limit in (m.lowerPositionLimit, m.upperPositionLimit))
+    q = pin.normalize(m, rng.uniform(low, high))
+    q[[m.idx_qs[m.getJointId(joint)] for girdle in body.table.girdles.values() for joint in girdle.joints]] = 0.0
+    pin.framesForwardKinematics(m, data, q)
+    R_WK = {m.names[joint]: data.oMi[joint].rotation for joint in range(m.njoints)}
+    R_WK |= {s: data.oMf[m.getFrameId(s)].rotation for s in body.table.segments}
+    lengths = np.array(list(body.lengths.values()))
+    for point, parts in body.reaches.items():
+        place = np.sum(
+            [R_WK[link] @ (part.by_length @ lengths + part.constant) for link, part in parts.items()], axis=0
+        )
+        expected = data.oMf[m.getFrameId(body.point_frames[point])].translation
+        np.testing.assert_allclose(place, expected, atol=1e-12)
 
 
 def test_one_length_leaves_the_others_and_the_directions_alone(urdf: Path) -> None:
@@ -181,16 +178,12 @@ def test_one_length_leaves_the_others_and_the_directions_alone(urdf: Path) -> No
             np.testing.assert_allclose(d["hand"], 0.3 * along, atol=1e-12)
 
 
-def test_a_longer_segment_is_heavier_by_its_volume_and_its_inertia_stretches() -> None:
+def test_a_longer_segment_is_heavier_by_its_volume() -> None:
     body = load_model()
     longer = body.with_lengths({"left_upper_arm": 1.5 * body.lengths["left_upper_arm"]})
-    k = body.joints["left_upper_arm"]
-    before, after = body.pin.inertias[k], longer.pin.inertias[k]
+    before, after = (each.pin.inertias[body.joints["left_upper_arm"]] for each in (body, longer))
     assert after.mass == pytest.approx(1.5 * before.mass)
     np.testing.assert_allclose(after.lever, before.lever * [1.0, 1.0, 1.5])
-    # ∫z² dm grows by 1.5³, ∫x² dm with the mass
-    second = [0.5 * np.trace(i) * np.eye(3) - i for i in (before.inertia, after.inertia)]
-    np.testing.assert_allclose(np.diag(second[1]), np.diag(second[0]) * [1.5, 1.5, 1.5**3], rtol=1e-9)
 
 
 def test_the_written_urdf_reads_the_same_everywhere(urdf: Path, tmp_path: Path) -> None:
@@ -332,7 +325,7 @@ def test_three_orthogonal_axes_in_any_order_are_one_spherical_joint(
         )
 
 
-@pytest.mark.parametrize("what", ["oblique", "apart", "heavy", "seen", "branched", "two", "prismatic"])
+@pytest.mark.parametrize("what", ["oblique", "apart", "heavy", "branched", "prismatic"])
 def test_what_is_no_spherical_joint_stays_as_it_is(what: str, tmp_path: Path) -> None:
     elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3")
     more = ""
@@ -344,13 +337,8 @@ def test_what_is_no_spherical_joint_stays_as_it_is(what: str, tmp_path: Path) ->
         inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
         heavy = f'<link name="left_forearm_1"><inertial><mass value="0.1"/>{inertia}</inertial></link>'
         elbow = elbow.replace('<link name="left_forearm_1"/>', heavy)
-    elif what == "seen":
-        ball = "<visual><geometry><sphere radius='0.1'/></geometry></visual>"
-        elbow = elbow.replace('<link name="left_forearm_0"/>', f'<link name="left_forearm_0">{ball}</link>')
     elif what == "branched":
         more = '<link name="mark"/>' + fixed("left_forearm_0", "mark", "0 0 0.1")
-    elif what == "two":
-        elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3", TRIPLE[:2], ("0 0 0",) * 2)
     elif what == "prismatic":
         elbow = elbow.replace('name="left_forearm_j2" type="revolute"', 'name="left_forearm_j2" type="prismatic"')
     text = small(elbow=elbow, more=more)
@@ -374,24 +362,19 @@ def test_meshes_are_named_and_not_read(tmp_path: Path, caplog: pytest.LogCapture
     assert caplog.records == []
 
 
-def cosmik(data: Path, folder: Path) -> BodyModel:
-    """A body whose table gives wrists as places on the forearms; it has no hands."""
+def test_a_human_with_such_textures_has_wrists_and_no_hands(data: Path, tmp_path: Path) -> None:
+    """Its table gives wrists as places on the forearms."""
     segments, points = {"torso": "torso", "pelvis": "pelvis"}, []
     for side, letter in (("left", "L"), ("right", "R")):
         segments |= {f"{side}_upper_arm": f"upperarm{letter}", f"{side}_forearm": f"lowerarm{letter}"}
         points.append(f'{side}_wrist = {{ link = "lowerarm{letter}", at = [0.0, -0.26, 0.0] }}')
-    more = "[points]\n" + "\n".join(points)
     top = f'urdf = "{data / "human_urdf" / "cosmik_human.urdf"}"\nup = "+y"\nroot = "pelvis"\n'
-    return load_model(written(folder, top + table_toml(segments, more), "cosmik.toml"))
-
-
-def test_a_human_with_such_textures_has_wrists_and_no_hands(data: Path, tmp_path: Path) -> None:
-    body = cosmik(data, tmp_path)
+    more = "[points]\n" + "\n".join(points)
+    body = load_model(written(tmp_path, top + table_toml(segments, more), "cosmik.toml"))
     # Its links are turned by 1.57 in place of a quarter turn.
     assert body.lengths["left_upper_arm"] == pytest.approx(0.2737, abs=1e-4)
     assert body.lengths["left_forearm"] == pytest.approx(0.26)
     assert "left_hand" not in body.lengths
-    assert "lowerarmL" in body.urdf()
     with pytest.raises(WeposeError) as raised:
         load_model(data / "human_urdf" / "cosmik_human.urdf")
     for name in ("left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm", "upperarmL"):
@@ -404,7 +387,7 @@ def test_implausible_lengths_are_warned_of(change: dict[str, float]) -> None:
     assert {d.place: d.value for d in diagnostics} == pytest.approx(change)
     assert {d.code for d in diagnostics} <= {"model-implausible"}
     for diagnostic in diagnostics:
-        assert f"is {change[diagnostic.place]:g} m long; adults have " in render(diagnostic).what
+        assert f"is {change[diagnostic.place]:g} m long; adults have " in str(diagnostic)
 
 
 HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))
@@ -447,14 +430,15 @@ def test_the_wrong_model_says_so_in_one_line(case: str, tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_and_lengths_that_cannot_be(tmp_path: Path) -> None:
-    with pytest.raises(WeposeError, match=r"none\.urdf"):
-        load_model(tmp_path / "none.urdf")
-    with pytest.raises(WeposeError, match=r"none\.toml"):
-        load_model(tmp_path / "none.toml")
-    with pytest.raises(WeposeError, match="did you mean 'left_forearm'"):
-        load_model(lengths={"left_forarm": 0.2})
-    with pytest.raises(WeposeError, match="above 0 and below 10 m"):
-        load_model(lengths={"left_forearm": -0.2})
+    for path in (tmp_path / "none.urdf", tmp_path / "none.toml"):
+        with pytest.raises(WeposeError, match=path.name):
+            load_model(path)
+    for lengths, said in (
+        ({"left_forarm": 0.2}, "did you mean 'left_forearm'"),
+        ({"left_forearm": -0.2}, "above 0 and below 10 m"),
+    ):
+        with pytest.raises(WeposeError, match=said):
+            load_model(lengths=lengths)
 
 
 # The table --------------------------------------------------------------------------------------------------------
@@ -476,18 +460,12 @@ def table_toml(segments: dict[str, str] = OTHER, more: str = "") -> str:
     return f'like = "upper_body"\n[segments]\n{rows}\n{more}'
 
 
-def load_as(folder: Path, text: str, top: str = "", segments: dict[str, str] = OTHER, more: str = "") -> BodyModel:
-    """The body of the text of a URDF by a table of its own."""
-    written(folder, text)
-    return load_model(written(folder, f'urdf = "small.urdf"\n{top}\n{table_toml(segments, more)}', "any.toml"))
-
-
 PALMS = '[points]\nleft_palm = "left_palm"\nright_palm = {link = "L_right_hand", at = [0, 0, -0.07]}'
 
 
 def test_a_table_is_given_or_lies_beside_its_urdf(tmp_path: Path) -> None:
-    by_table = load_as(tmp_path, other_names(small()), more=PALMS)
-    written(tmp_path, f'urdf = "small.urdf"\n{table_toml(more=PALMS)}', "model.toml")
+    written(tmp_path, other_names(small()))
+    by_table = load_model(written(tmp_path, f'urdf = "small.urdf"\n{table_toml(more=PALMS)}', "model.toml"))
     model = load_model(tmp_path / "small.urdf")
     plain = load_model(written(tmp_path, small(), "plain.urdf"))
     for body in (by_table, model):
@@ -497,24 +475,11 @@ def test_a_table_is_given_or_lies_beside_its_urdf(tmp_path: Path) -> None:
     assert again.lengths == pytest.approx(plain.lengths, abs=1e-12)
 
 
-def test_a_link_that_bears_our_name_in_another_frame_gives_way(tmp_path: Path) -> None:
-    own = {name: name for name in OTHER}
-    turned = load_as(
-        tmp_path, small(), segments=own | {"left_forearm": '{link = "left_forearm", up = "+x", forward = "+y"}'}
-    )
-    at = link_placements(turned.pin, pin.neutral(turned.pin))
-    R_WL = at["left_forearm"][:3, :3]
-    np.testing.assert_allclose(R_WL @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], atol=1e-12)  # up of the segment: x of the link
-    np.testing.assert_allclose(R_WL @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)  # forward: y
-    raw = pin.buildModelFromXML(small())
-    np.testing.assert_allclose(at["left_forearm_link"], link_placements(raw, pin.neutral(raw))["left_forearm"])
-    assert "left_forearm_link" in turned.joints
-
-
 def test_up_and_forward_turn_the_body_upright(tmp_path: Path) -> None:
     text = other_names(small()).replace('<link name="root" />', '<link name="base"/><link name="root"/>')
-    text = text.replace("</robot>", fixed("base", "root", "0 0 0") + "</robot>")
-    body = load_as(tmp_path, text, 'up = "+z"\nforward = "-y"')
+    written(tmp_path, text.replace("</robot>", fixed("base", "root", "0 0 0") + "</robot>"))
+    table = f'urdf = "small.urdf"\nup = "+z"\nforward = "-y"\n{table_toml()}'
+    body = load_model(written(tmp_path, table, "any.toml"))
     at = link_placements(body.pin, pin.neutral(body.pin))
     np.testing.assert_allclose(at["base"][:3, :3] @ [0.0, -1.0, 0.0], [1.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(at["torso"][:3, :3], np.eye(3), atol=1e-12)
@@ -543,13 +508,3 @@ def test_a_wrong_table_says_so_in_one_line(case: str, tmp_path: Path) -> None:
         load_model(written(tmp_path, 'urdf = "small.urdf"\n' + text, "table.toml"))
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-def test_a_breadth_gives_the_length_between_joint_centres() -> None:
-    converted = convert_breadths({"biacromial": 0.4, "left_forearm": 0.27}, load_table(), 0.003)
-    assert converted["left_forearm"] == (0.27, 0.003)
-    metres, std = converted["shoulder_width"]
-    assert metres == pytest.approx(0.332)
-    assert std == pytest.approx(np.hypot(0.03 * 0.4, 0.83 * 0.003))
-    with pytest.raises(WeposeError, match="one follows from the other"):
-        convert_breadths({"biacromial": 0.4, "shoulder_width": 0.33}, load_table(), 0.003)
