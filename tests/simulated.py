@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.subject import Subject
-from wepose_pin.recording import Recording
-from wepose_pin.simulation import Simulation
-from wepose_pin.tracking.segment_orientations import SegmentOrientations, TrackOptions
-from wepose_pin.tracking.segments import SegmentEstimator
+from wepose_pin import Simulation
 
 G = 9.81
 SIDES = ("left", "right")
@@ -27,11 +21,6 @@ SUBJECT = {
     "right_forearm": 0.247,
     "right_hand": 0.078,
 }
-
-
-def estimate_segments(recording: Recording, subject: Subject | None = None, **options: Any) -> SegmentOrientations:
-    """Segment orientations of a whole recording from the N-pose, by options of `TrackOptions`."""
-    return SegmentEstimator(subject, TrackOptions(**options)).push(recording)
 
 
 def within(sim: Simulation, *phases: str) -> np.ndarray:
