@@ -9,11 +9,10 @@ import numpy as np
 import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import estimate_segments
 from test_bad_input import refused
 
 from benchmarks.trials import read_broad
-from wepose_pin import estimate_orientation, load_session, rotations
+from wepose_pin import estimate_orientation, load_session, rotations, track
 from wepose_pin.diagnostics import Diagnostic
 from wepose_pin.errors import BadData
 from wepose_pin.recording import ImuSensor, Recording
@@ -139,7 +138,7 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
     assert all(np.isinf(sensor.gyro_range) for name, sensor in read.sensors.items() if name != BROKEN)
 
     def worst(recording: Recording) -> float:
-        of = estimate_segments(recording, method=method).orientation[BROKEN]
+        of = track(recording, method=method, open_loop=True).segments.orientation[BROKEN]
         R_VS = Rotation.from_quat(of.quat_VS)
         off = (turned[300].inv() * turned).inv() * (R_VS[300].inv() * R_VS)
         return float((off.magnitude() / np.sqrt(np.linalg.eigvalsh(of.attitude_cov)[:, -1]))[450:].max())
@@ -148,7 +147,7 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
     assert worst(read) < 6.0
     chunks = track_chunks(read, options=TrackOptions(method), chunk_s=6.0)
     pieces = [chunk.segments.orientation[BROKEN].quat_VS for chunk in chunks]
-    of = estimate_segments(read, method=method).orientation[BROKEN]
+    of = track(read, method=method, open_loop=True).segments.orientation[BROKEN]
     np.testing.assert_array_equal(np.concatenate(pieces), of.quat_VS)
 
 
