@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
 from benchmarks.trials import read_broad
-from wepose_pin import estimate_orientation, load_session, rotations, track
+from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.diagnostics import Diagnostic
 from wepose_pin.errors import BadData
 from wepose_pin.recording import ImuSensor, Recording
