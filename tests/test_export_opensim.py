@@ -19,7 +19,7 @@ from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 from wepose_pin.angles import joint_angles
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import Pose, compute_pose
-from wepose_pin.readers import load_session
+from wepose_pin.errors import BadData
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.writers.export import export
 
@@ -104,19 +104,21 @@ def test_sto_keeps_the_rules(result: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-8)
 
 
-def test_sto_is_read_back_as_it_was(result: Path, tmp_path: Path) -> None:
-    """As segments of the body, with nothing to state but which way they faced."""
+def test_sto_holds_the_bodies_in_ground_and_is_no_recording(result: Path, tmp_path: Path) -> None:
+    """In the N-pose bodies are parallel to ground, but for the forearm and hand, which are pronated by 90°."""
     export(result, tmp_path / "x.sto")
-    session = describe_file(tmp_path / "x.sto").session
-    assert session is not None
-    (tmp_path / "session.toml").write_text(session)
-    recording = load_session(tmp_path)
-    pose = a_pose()
-    assert set(recording.sensors) == set(SEGMENT_OF.values())
-    for segment, sensor in recording.sensors.items():
-        assert sensor.aligned
-        same = np.einsum("nc,nc->n", sensor.quat_VS, pose.quat_WL[segment])
-        np.testing.assert_allclose(np.abs(same), 1.0, atol=1e-8)
+    lines = (tmp_path / "x.sto").read_text().split("\n")
+    rows = np.array([line.replace(",", "\t").split("\t") for line in lines[lines.index("endheader") + 2 : -1]], float)
+    R_GW = Rotation.from_euler("x", -90, degrees=True)
+    for k, (body, segment) in enumerate(SEGMENT_OF.items()):
+        R_GB = Rotation.from_quat(rows[:, 1 + 4 * k : 5 + 4 * k][:, [1, 2, 3, 0]])
+        n_pose = R_GW * Rotation.from_quat(a_pose().quat_WL[segment]).inv() * R_GW.inv() * R_GB
+        angle = 90.0 if body.startswith(("radius", "hand")) else 0.0
+        np.testing.assert_allclose(np.degrees(n_pose.magnitude()), angle, atol=1e-5)
+        if angle:
+            np.testing.assert_allclose(np.abs(n_pose.as_rotvec() / n_pose.magnitude()[:, None])[:, 1], 0.998, atol=1e-3)
+    with pytest.raises(BadData, match="was written by `wepose export`"):
+        describe_file(tmp_path / "x.sto")
 
 
 def test_trc_keeps_the_rules(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from test_info import info
 from wepose_pin.body.kinematics import Pose, build_pose_table
 from wepose_pin.errors import WeposeError
 from wepose_pin.evaluation import angle_error, compute_icc, evaluate, register
-from wepose_pin.readers.markers import read_marker_table
-from wepose_pin.readers.reference import Reference, read_reference
+from wepose_pin.readers.device import Reference
+from wepose_pin.readers.reference import read_marker_table, read_reference
 from wepose_pin.simulation import Person, Simulation
 from wepose_pin.tracking import summarize, track
 from wepose_pin.writers import write_result

@@ -58,6 +58,17 @@ class Device(NamedTuple):
         return min(float(np.nanmin(sensor.time)) for sensor in self.sensors.values())
 
 
+class Reference(NamedTuple):
+    """What another system measured, on its own clock and in its own world V."""
+
+    time: np.ndarray  # (n,) [s]
+    quat_VT: Mapping[str, np.ndarray]  # segment → (n, 4) xyzw, its frame to V; NaN: missing
+    points: Mapping[str, np.ndarray]  # point → (n, 3) [m] in V; NaN: missing
+    up: str | None = None  # the axis of V that is up; None: not known
+    own_frames: bool = False  # frames are of another convention than ours
+    diagnostics: tuple[Diagnostic, ...] = ()
+
+
 def make_device(
     path: Path,
     sensors: Mapping[str, Mapping[str, Signal]],

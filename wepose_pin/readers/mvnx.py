@@ -25,8 +25,7 @@ from ..body.table import ROOT
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..libraries import library_errors
-from .device import Device, DeviceSensor, check_measured
-from .markers import Reference
+from .device import Device, DeviceSensor, Reference, check_measured
 
 _SIDES = ("Left", "Right")
 SEGMENT_OF = {

@@ -1,5 +1,7 @@
 """Files of other systems as a reference for `wepose evaluate`: MVNX, C3D, and TRC, markers as OpenSim writes them.
 
+Joint centres and segment orientations follow from markers by a small table (``markers.toml``, or one of the user's).
+
 C3D, by ezc3d: points in POINT:UNITS at POINT:RATE; a residual below 0, NaN or zeros mark a missing one. Labels lose a
 subject before a colon. Rotations (HAS-Motion's extension, as Theia3D writes it) are 4×4 transforms of a segment to the
 laboratory at ROTATION:RATE, labelled ``l_uarm_4X4``, or ``left_upper_arm_4X4`` by `wepose export`.
@@ -14,21 +16,34 @@ Sources: the C3D File Format user guide (c3d.org); HAS-Motion's description of R
 from __future__ import annotations
 
 import contextlib
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
+from scipy.spatial.transform import Rotation
 
 from ..data_tables import read_body
+from ..documents import TomlTable, read_toml
 from ..errors import BadData, one_of
 from ..libraries import check_file, import_library, library_errors
-from .device import check_measured, read_first_lines
-from .markers import MarkerTable, Reference, locate, quat_from_matrices, read_marker_table
+from .device import Reference, check_measured, read_first_lines
 from .mvnx import read_mvnx_reference
 
 SUFFIXES = (".c3d", ".trc", ".mvnx")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "millimeters": 1e-3}
+SIDES = ({"side": "left", "S": "L", "s": "l"}, {"side": "right", "S": "R", "s": "r"})
+# The axes of a segment's frame (x forward, y left, z up in the N-pose) that a direction is of.
+DIRECTIONS = {"up": "z", "left": "y", "forward": "x", "lateral": "y"}
+# Table → what its entries look like.
+_FORMS = {
+    "points": '[["A", "B"], ["C"]], ways, each of markers',
+    "segments": '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions',
+    "rotations": "the name of a rotation",
+}
 
 
 def is_reference(path: Path) -> bool:
@@ -41,8 +56,8 @@ def read_reference(path: Path, markers: Path | None = None) -> Reference:
 
     Raises
     ------
-    MissingFile, BadData
-        Not there; damaged; without what is needed.
+    MissingFile, BadSession, BadData
+        A file is not there, is damaged, or lacks what is needed.
     """
     check_file(path, "a C3D, TRC or MVNX")
     suffix = path.suffix.lower()
@@ -50,18 +65,21 @@ def read_reference(path: Path, markers: Path | None = None) -> Reference:
         return read_mvnx_reference(path)
     table = read_marker_table(markers)
     if suffix == ".trc":
-        return locate(path, *_read_trc(path), table)
+        return _locate(path, *_read_trc(path), table)
     ezc3d = import_library("ezc3d", path, "a C3D")
     with library_errors(path, "a C3D"):
         file = ezc3d.c3d(str(path))
     if not file["data"]["rotations"].size:
-        return locate(path, *_read_markers(path, file), table)
+        return _locate(path, *_read_markers(path, file), table)
     reference = _read_rotations(path, file, table)
     if file["data"]["points"].size and file["data"]["points"].shape[2] == len(reference.time):
         time, places = _read_markers(path, file)
         with contextlib.suppress(BadData):  # markers of which no joint follows
-            reference = reference._replace(points=locate(path, time, places, table).points)
+            reference = reference._replace(points=_locate(path, time, places, table).points)
     return reference
+
+
+# C3D and TRC ---------------------------------------------------------------------------------------------------------
 
 
 def _values(file: Any, group: str, name: str) -> list[Any]:
@@ -110,7 +128,7 @@ def _read_rotations(path: Path, file: Any, table: MarkerTable) -> Reference:
     for segment, name in table.rotations.items():
         label = next((each for each in (name, segment) if each in labels), None)
         if label is not None:
-            quats[segment] = quat_from_matrices(transforms[:, labels.index(label), :3, :3])
+            quats[segment] = _quat_from_matrices(transforms[:, labels.index(label), :3, :3])
     if not quats:
         listed = ", ".join(labels[:8]) or "without labels"
         raise BadData(f"{path}: its rotations are of no known segment ({listed}); name them under --markers")
@@ -144,3 +162,114 @@ def _read_trc(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     check_measured(f"{path}: a marker", rows[:, 2:])
     points = UNITS[unit] * rows[:, 2:].reshape(len(rows), -1, 3)
     return rows[:, 1], {name: points[:, k] for k, name in enumerate(names)}
+
+
+# Markers -------------------------------------------------------------------------------------------------------------
+
+
+class MarkerTable(NamedTuple):
+    """How points and segments follow from markers, with sides written out."""
+
+    points: Mapping[str, Sequence[Sequence[str]]]
+    segments: Mapping[str, Sequence[Mapping[str, Sequence[Sequence[str]]]]]
+    rotations: Mapping[str, str]
+    own: Mapping[str, Sequence[Sequence[str]]] = MappingProxyType({})  # points of the user's table
+
+
+def read_marker_table(path: Path | None = None) -> MarkerTable:
+    """Read a table of markers; None: the shipped one. What a user's table has goes before that."""
+    table = _read_table(Path(__file__).with_name("markers.toml"))
+    if path is None:
+        return table
+    own = _read_table(path)
+
+    def join(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: [*theirs.get(name, ()), *ours.get(name, ())] for name in {**ours, **theirs}}
+
+    points, segments = join(table.points, own.points), join(table.segments, own.segments)
+    return MarkerTable(points, segments, {**table.rotations, **own.rotations}, own.points)
+
+
+def _read_table(path: Path) -> MarkerTable:
+    top = TomlTable(read_toml(path, "a table of markers"), str(path))
+    top.allow(*_FORMS)
+    entries: dict[str, dict[str, Any]] = {key: {} for key in _FORMS}
+    for key, form in _FORMS.items():
+        for name, value in top.table(key, {}).values.items():
+            for side in SIDES if "{" in name else SIDES[:1]:
+                own = json.dumps({name: value}, default=str)
+                for sign, word in side.items():
+                    own = own.replace(f"{{{sign}}}", word)
+                ((own_name, entry),) = json.loads(own).items()
+                if not _has_form(key, entry):
+                    raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
+                entries[key][own_name] = entry
+    return MarkerTable(**entries)
+
+
+def _has_form(key: str, value: Any) -> bool:
+    """Return whether an entry of a table is what `_FORMS` says."""
+    if key == "rotations" or not isinstance(value, list):
+        return key == "rotations" and isinstance(value, str)
+    if key == "points":
+        return all(isinstance(way, list) and way and all(isinstance(name, str) for name in way) for way in value)
+    return all(
+        isinstance(frame, dict)
+        and len(frame) == len({DIRECTIONS[name] for name in frame if name in DIRECTIONS}) == 2
+        and all(_has_form("points", ends) and len(ends) == 2 for ends in frame.values())
+        for frame in value
+    )
+
+
+def _locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], table: MarkerTable) -> Reference:
+    """Locate the joints and orient the segments of a body by its markers, name → (n, 3) [m]."""
+    known = dict(markers)
+    points: dict[str, np.ndarray] = {}
+    for name, ways in table.points.items():
+        way = next((way for way in ways if set(way) <= set(known)), None)
+        if way is not None:
+            points[name] = np.mean([known[each] for each in way], axis=0)
+            known.setdefault(name, points[name])
+    for name, ways in table.own.items():
+        lost = [marker for way in ways for marker in way if marker not in known]
+        if lost and not any(set(way) <= set(known) for way in ways):
+            raise BadData(f"{path}: no marker '{lost[0]}', by which {name} is stated; {one_of(markers, lost[0])}")
+    quats = {}
+    for segment, frames in table.segments.items():
+        for frame in frames:
+            if {each for ends in frame.values() for end in ends for each in end} <= set(known):
+                quats[segment] = _orient(segment, frame, known)
+                break
+    if not points and not quats:
+        expected = sorted({each for ways in table.points.values() for way in ways for each in way} - set(table.points))
+        raise BadData(
+            f"{path}: no joint follows from its markers ({', '.join(list(markers)[:8]) or 'none'}, …); "
+            f"{one_of(expected, most=12)}. Name yours in a table of markers (--markers)"
+        )
+    return Reference(time, quats, points)
+
+
+def _orient(segment: str, frame: Mapping[str, Sequence[Sequence[str]]], known: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Orient a segment (n, 4) xyzw by two directions, the first of which is exact; NaN where markers are missing."""
+    axes: dict[str, np.ndarray] = {}
+    for direction, (begin, end) in frame.items():
+        sign = -1.0 if direction == "lateral" and segment.startswith("right") else 1.0
+        along = np.mean([known[each] for each in end], axis=0) - np.mean([known[each] for each in begin], axis=0)
+        axes[DIRECTIONS[direction]] = sign * along
+    (first, exact), (second, near) = axes.items()
+    third = ({"x", "y", "z"} - {first, second}).pop()
+    in_order = first + second in "xyzx"
+    across = np.cross(exact, near) if in_order else np.cross(near, exact)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axes = {name: v / np.linalg.norm(v, axis=1)[:, None] for name, v in ((first, exact), (third, across))}
+    axes[second] = np.cross(axes[third], axes[first]) if in_order else np.cross(axes[first], axes[third])
+    return _quat_from_matrices(np.stack([axes[axis] for axis in "xyz"], axis=2))
+
+
+def _quat_from_matrices(R: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) xyzw of matrices (n, 3, 3), NaN where they are no rotations."""
+    quat = np.full((len(R), 4), np.nan)
+    good = np.isfinite(R).all(axis=(1, 2))
+    good &= np.abs(np.linalg.det(np.where(good[:, None, None], R, 0.0)) - 1.0) < 0.01
+    quat[good] = Rotation.from_matrix(R[good]).as_quat()
+    return quat

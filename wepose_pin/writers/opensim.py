@@ -1,35 +1,56 @@
 """OpenSim's files: joint angles (.mot), orientations for OpenSense (.sto), points (.trc), the set-ups of its tools.
 
-In OpenSim's ground G (x forward, y up, z right), the angles and the bodies those of Rajagopal's model (`rajagopal`).
+In OpenSim's ground G (x forward, y up, z right). Coordinates and bodies are those of Rajagopal's full-body model, whose
+frames are parallel to G in the anatomical position, where all coordinates are zero; bodies and lengths stand in
+``rajagopal.toml``, axes and their order are those of Rajagopal_2015.osim.
 
-Sources: opensim-core, OpenSim/Common: DelimFileAdapter.h (.mot, .sto: ``endheader`` alone in a line, tabs, no empty
-line), Storage.cpp (.mot: the name first, ``nRows`` and ``nColumns``), TRCFileAdapter.cpp (.trc: eight keys, a tab ends
-each row, a marker with an empty cell is missing).
+Sources: Rajagopal et al. 2016, IEEE Trans. Biomed. Eng. 63:2068, doi 10.1109/TBME.2016.2586891; opensim-core,
+OpenSim/Common: DelimFileAdapter.h (.mot, .sto: ``endheader`` alone in a line, tabs, no empty line), Storage.cpp (.mot:
+the name first, ``nRows`` and ``nColumns``), TRCFileAdapter.cpp (.trc: eight keys, a tab ends each row, a marker with an
+empty cell is missing).
 """
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 import polars as pl
+from scipy.spatial.transform import Rotation
 
-from ..angles import diagnose_lock, joint_angles
+from ..angles import NEAR_LOCK, diagnose_lock, euler, joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
+from ..rotations import conjugate, multiply, rotation_about
 from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
-from .rajagopal import LENGTHS, coordinates, in_ground, orientations
 
 SETUPS = Path(__file__).parent / "opensim_setups"
 GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
 # [rad] rms by which the model may miss a body. Its elbow turns about an axis that is 13 deg oblique: arms of simulated
 # people, whose orientations are exact, are missed by 3 to 7 deg, of a real recording by up to 9.
 MOST_MISSED = np.deg2rad(12.0)
+# OpenSim's ground G: x forward, y up, z right.
+_R_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+# The axis of `pro_sup_r` in the humerus (Rajagopal_2015.osim); the left one is mirrored on the sagittal plane.
+_PRONATION = np.array([0.05639803, 0.99840646, 0.001952])
+_MODEL = tomllib.loads(Path(__file__).with_name("rajagopal.toml").read_text(encoding="utf-8"))
+BODIES: Mapping[str, str] = _MODEL["bodies"]
+LENGTHS: Mapping[str, Mapping[str, Any]] = _MODEL["lengths"]
+# Axes of a right arm's elbow and wrist in the body above; a left arm's are mirrored on the sagittal plane.
+_AXES = (0.22604696, 0.022269, 0.97386183), _PRONATION, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+# Their coordinates, and the middle of each range [rad]: angles are given within half a turn of it. Followed over time,
+# an elbow that was once bent as none can be might keep a full turn too much.
+_MIDDLE = {"elbow_flex": np.radians(75.0), "pro_sup": np.radians(90.0), "wrist_flex": 0.0, "wrist_dev": 0.0}
+_MIRRORED = np.array([-1.0, -1.0, 1.0, 1.0])  # xyzw, z → −z
+_ROUNDS, _DAMPING = 40, 1e-9  # of Gauss-Newton; about ten are the rule
+_CLOSE = 1e-9  # [rad] of the last step
 
 
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
@@ -192,3 +213,129 @@ def _write_rows(path: Path, header: Sequence[str], rows: pl.DataFrame, labels: b
         rows.fill_nan(None).write_csv(
             file, separator="\t", include_header=labels, float_precision=6, quote_style="never", line_terminator="\n"
         )
+
+
+# Rajagopal's model ---------------------------------------------------------------------------------------------------
+
+
+def _compute_n_pose(body: str) -> Rotation:
+    """Compute a body's rotation to G in the N-pose, palms to the thighs: 90° of `pro_sup`."""
+    if not body.startswith(("radius", "hand")):
+        return Rotation.identity()
+    mirror = np.array([-1.0, -1.0, 1.0]) if body.endswith("_l") else 1.0
+    return Rotation.from_rotvec(np.pi / 2.0 * mirror * _PRONATION / np.linalg.norm(_PRONATION))
+
+
+def in_ground(p_W: np.ndarray) -> np.ndarray:
+    """Return vectors (n, 3) of W in G."""
+    return np.column_stack([p_W[:, 0], p_W[:, 2], -p_W[:, 1]])
+
+
+def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Compute body → `quat_GB` (n, 4) xyzw, of the segments that are bodies of the model.
+
+    The N-pose, palms to the thighs, is the model with 90° of `pro_sup` and zero of all others.
+    """
+    quat_GW = _R_GW.as_quat()
+    bodies = {}
+    for segment, body in BODIES.items():
+        if segment in quat_WL:
+            moved = multiply(multiply(quat_GW, quat_WL[segment]), conjugate(quat_GW))
+            bodies[body] = multiply(moved, _compute_n_pose(body).as_quat())
+    return bodies
+
+
+def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Compute coordinate → (n,) [rad], and body → angle [rad], rms, by which the model misses it.
+
+    Torso, pelvis and shoulders turn about z, x, y, reach every orientation and are followed over time. Elbow and wrist
+    have two axes: of each arm the sum of the squared angles between the model's bodies and the measured ones is the
+    least, as it is for OpenSense with equal weights. A pelvis without a sensor stands still and upright.
+    """
+    columns: dict[str, np.ndarray] = {}
+    residuals: dict[str, float] = {}
+
+    def add(quat: np.ndarray, names: Sequence[str]) -> None:
+        angles = euler.follow(euler.decompose(quat, "ZXY"), "ZXY", NEAR_LOCK)
+        columns.update(zip(names, angles.T, strict=True))
+
+    if "pelvis" in quat_GB:
+        add(quat_GB["pelvis"], ("pelvis_tilt", "pelvis_list", "pelvis_rotation"))
+    if "torso" in quat_GB:
+        lumbar = multiply(conjugate(quat_GB.get("pelvis", np.array([0.0, 0.0, 0.0, 1.0]))), quat_GB["torso"])
+        add(lumbar, ("lumbar_extension", "lumbar_bending", "lumbar_rotation"))
+    for side in "rl":
+        arm = [name for body in ("humerus", "radius", "hand") if (name := f"{body}_{side}") in quat_GB]
+        if not arm or arm[0] != f"humerus_{side}":
+            continue
+        mirror = _MIRRORED if side == "l" else 1.0
+        quat = [quat_GB[name] * mirror for name in arm]
+        below: dict[str, np.ndarray] = {}
+        if arm[1:2] == [f"radius_{side}"]:
+            quat[0], angles, misses = _fit_arm(quat)
+            below = {f"{name}_{side}": value for name, value in zip(_MIDDLE, angles, strict=False)}
+            residuals |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, misses, strict=True)}
+        if "torso" in quat_GB:
+            shoulder = multiply(conjugate(quat_GB["torso"] * mirror), quat[0])
+            add(shoulder, [f"{name}_{side}" for name in ("arm_flex", "arm_add", "arm_rot")])
+        columns |= below
+    return columns, residuals
+
+
+def _fit_arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Fit the humerus (n, 4), the angles of elbow and wrist, and how far each body is off, all (n,) [rad].
+
+    `quat`: orientations (n, 4) of humerus, radius and, where it is measured, hand.
+    """
+    axes = [np.array(axis) / np.linalg.norm(axis) for axis in _AXES[: 2 * len(quat) - 2]]
+    starts: list[np.ndarray] = []
+    for k in range(len(quat) - 1):
+        starts += _solve_two_axes(axes[2 * k], axes[2 * k + 1], multiply(conjugate(quat[k]), quat[k + 1]))
+    angles, humerus = np.column_stack(starts), quat[0]
+    for _ in range(_ROUNDS):
+        error, J = _body_errors(humerus, angles, axes, quat)
+        A = np.swapaxes(J, 1, 2) @ J + _DAMPING * np.eye(J.shape[2])
+        step = -np.linalg.solve(A, np.swapaxes(J, 1, 2) @ error[:, :, None])[:, :, 0]
+        humerus = multiply(humerus, np.column_stack([0.5 * step[:, :3], np.ones(len(humerus))]))
+        humerus /= np.linalg.norm(humerus, axis=1)[:, None]
+        angles = angles + step[:, 3:]
+        if np.abs(step).max() < _CLOSE:
+            break
+    error, _ = _body_errors(humerus, angles, axes, quat)
+    middle = np.array(list(_MIDDLE.values())[: angles.shape[1]])
+    angles -= 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
+    return humerus, list(angles.T), [np.linalg.norm(part, axis=1) for part in np.split(error, len(quat), axis=1)]
+
+
+def _body_errors(
+    humerus: np.ndarray, angles: np.ndarray, axes: list[np.ndarray], quat: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the rotation vectors (n, 3 m) from the m measured bodies to the model's, and their Jacobian.
+
+    The Jacobian (n, 3 m, 3 + k) is by a turn of the humerus on its right and by the k angles. The change of a rotation
+    vector is taken as that of the turn: the gradient of its square is exact so.
+    """
+    n = len(humerus)
+    error, J = np.empty((n, 3 * len(quat))), np.zeros((n, 3 * len(quat), 3 + angles.shape[1]))
+    body = humerus
+    columns = np.tile(np.eye(3), (n, 1, 1))  # what moves the body, in its own axes: (n, 3, …)
+    for m, measured in enumerate(quat):
+        for k in (2 * m - 2, 2 * m - 1) if m else ():
+            turn = rotation_about(axes[k], angles[:, k])
+            body = multiply(body, turn)
+            back = Rotation.from_quat(conjugate(turn)).as_matrix()
+            columns = np.concatenate([back @ columns, np.tile(axes[k][:, None], (n, 1, 1))], axis=2)
+        error[:, 3 * m : 3 * m + 3] = Rotation.from_quat(multiply(conjugate(measured), body)).as_rotvec()
+        J[:, 3 * m : 3 * m + 3, : columns.shape[2]] = columns
+    return error, J
+
+
+def _solve_two_axes(a: np.ndarray, b: np.ndarray, quat: np.ndarray) -> list[np.ndarray]:
+    """Compute the angles (n,) [rad] about two axes that come nearest to rotations (n, 4).
+
+    The scalar product of the two quaternions is a cosine of half their difference and one of half their sum, summed.
+    """
+    v, w = quat[:, :3], quat[:, 3]
+    m = v @ np.cross(a, b) - w * (a @ b)
+    difference, total = np.arctan2(v @ (a - b), w + m), np.arctan2(v @ (a + b), w - m)
+    return [total + difference, total - difference]
