@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,23 +205,6 @@ def test_c3d_of_a_segment_whose_place_is_not_known_has_its_rotation(tmp_path: Pa
     R_WL = Rotation.from_quat(lone.quat_WL["right_forearm"]).as_matrix()
     np.testing.assert_allclose(file["data"]["rotations"][:3, :3, k].transpose(2, 0, 1), R_WL, atol=1e-7)
     np.testing.assert_array_equal(file["data"]["rotations"][:3, 3, k], 0.0)
-
-
-def test_c3d_on_a_full_disk_leaves_the_earlier_file(
-    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ezc3d = pytest.importorskip("ezc3d")
-    (tmp_path / "x.c3d").write_text("earlier")
-    whole = ezc3d.c3d.write
-
-    def write(file: object, path: str) -> None:
-        whole(file, path)
-        os.truncate(path, os.path.getsize(path) // 2)
-
-    monkeypatch.setattr(ezc3d.c3d, "write", write)
-    with pytest.raises(ExistingOutput, match=r"x\.c3d: cannot be written: the disk seems to be full"):
-        export(result, tmp_path / "x.c3d", force=True)
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("x.c3d", "earlier")]
 
 
 # BVH --------------------------------------------------------------------------------------------------------------

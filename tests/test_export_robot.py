@@ -23,7 +23,7 @@ from wepose_pin.commands import main
 from wepose_pin.errors import WeposeError
 from wepose_pin.tracking import TrackResult
 from wepose_pin.writers.export import export
-from wepose_pin.writers.joint_motion import (
+from wepose_pin.writers.motion import (
     JointMotion,
     compute_link_poses_W,
     read_joint_motion,
@@ -256,7 +256,6 @@ def change_urdf(folder: Path, old: str, new: str) -> None:
         (lambda f: change_table(f, pl.col("time") ** 1.5 + pl.col("time")), "times that are uneven; a data set"),
         (lambda f: change_table(f, pl.col("time") * 1.003), "49.8504 samples a second, or times that are uneven"),
         (lambda f: change_urdf(f, "</robot>", ""), "robot.urdf: is no complete XML file"),
-        (lambda f: change_urdf(f, '"elbow"', '"knee"'), "robot.urdf: no joint 'elbow'; summary.json beside it names"),
         (lambda f: (f / "trajectory.parquet").write_bytes(b"PAR1"), "trajectory.parquet"),
     ],
 )  # fmt: skip

@@ -22,7 +22,7 @@ from wepose_pin.body.kinematics import Pose
 from wepose_pin.body.links import compute_link_poses
 from wepose_pin.errors import BadOption
 from wepose_pin.writers.export import export
-from wepose_pin.writers.joint_motion import JointMotion, compute_link_poses_W, read_joint_motion
+from wepose_pin.writers.motion import JointMotion, compute_link_poses_W, read_joint_motion
 from wepose_pin.writers.rrd import _load_meshes
 
 pytest.importorskip("rosbags")

@@ -15,7 +15,7 @@ from arms import JOINTS
 from test_export_robot import find_lerobot, write_trajectory_folder
 
 from wepose_pin.writers.export import export
-from wepose_pin.writers.joint_motion import compute_link_poses_W, read_joint_motion
+from wepose_pin.writers.motion import compute_link_poses_W, read_joint_motion
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "play.md"
 SCRIPTS = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL))

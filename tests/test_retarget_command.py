@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin import retargeting
 from wepose_pin.commands import main
-from wepose_pin.writers.joint_motion import compute_link_poses_W, read_joint_motion
+from wepose_pin.writers.motion import compute_link_poses_W, read_joint_motion
 
 pytest.importorskip("daqp")
 

@@ -420,9 +420,9 @@ def _report_full_disk(out: Path) -> Iterator[None]:
     """Raise an error that names the output when the disk is full; the system's error names no file, or an input."""
     try:
         yield
-    except OSError as error:
+    except Exception as error:
         # An error of polars has the system's text but no number.
-        if error.errno in _FULL or any(os.strerror(number) in str(error) for number in _FULL):
-            why = error.strerror or str(error)
+        if getattr(error, "errno", None) in _FULL or any(os.strerror(number) in str(error) for number in _FULL):
+            why = getattr(error, "strerror", None) or str(error)
             raise ExistingOutput(f"{out}: cannot be written: {why}; nothing was written") from error
         raise

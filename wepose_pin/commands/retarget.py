@@ -96,7 +96,7 @@ def retarget(
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
     from ..writers import read_result
-    from ..writers.joint_motion import REPETITIONS
+    from ..writers.motion import REPETITIONS
     from ..writers.provenance import collect_provenance
     from ..writers.result import as_json, read_phases
 

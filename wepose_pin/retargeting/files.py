@@ -15,7 +15,7 @@ from ..body.urdf import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..recording import format_span
 from ..recording.gaps import find_runs
-from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY
+from ..writers.motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
 from .checks import LimitCheck, SelfCollisions
 from .placement import place_root

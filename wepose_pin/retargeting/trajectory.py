@@ -25,7 +25,7 @@ from ..body.urdf import read_urdf, resolve_meshes
 from ..errors import BadOption, WrongOption
 from ..recording import select_interval
 from ..tracking import TrackResult
-from ..writers.joint_motion import JointMotion
+from ..writers.motion import JointMotion
 from .collision import CollisionModel
 from .controller import ControllerParams, JointState, QpController, StepReport
 from .limits import MAX_STOP_S

@@ -7,7 +7,6 @@ labelled ``…_4X4``, with the translation in the unit of the points.
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from ..body.links import compute_link_poses, find_known_links
 from ..errors import BadData, BadOption, how_to_install
 from .motion import Motion, find_measured_points, resample_evenly
 
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
 
 
@@ -47,54 +47,36 @@ def write_c3d(path: Path, motion: Motion) -> None:
     file.add_parameter("POINT", "Y_SCREEN", ["+Z"])
     file["data"]["points"] = np.concatenate([1e3 * p_W, np.ones((1, *p_W.shape[1:]))])
     file["data"]["meta_points"]["residuals"] = np.where(np.isfinite(p_W).all(axis=0), 0.0, -1.0)[None]
-    segments = _compute_transforms(motion)
-    if segments:
+    if motion.pose.quat_WL:
+        segments = _compute_transforms(motion)
         file.add_parameter("ROTATION", "RATE", [motion.rate_hz])
         file.add_parameter("ROTATION", "UNITS", ["mm"])
         file.add_parameter("ROTATION", "LABELS", [f"{segment}_4X4" for segment in segments])
         file["data"]["rotations"] = np.stack(list(segments.values()), axis=-1).transpose(1, 2, 3, 0)
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
-    try:
-        file.write(str(named))
-        _check_whole(named, 16 * p_W.shape[1] * n + 68 * len(segments) * n)
-        named.replace(path)
-    finally:
-        named.unlink(missing_ok=True)
-
-
-def _check_whole(file: Path, size: int) -> None:
-    """Raise the system's error of a full disk for a file with fewer than `size` bytes of data: ezc3d raises none."""
-    with file.open("rb") as opened:
-        first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
-    if file.stat().st_size < 512 * (first_block - 1) + size:
-        raise OSError(errno.ENOSPC, "the disk seems to be full")
+    file.write(str(named))
+    named.replace(path)
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
     """Segment → (n, 4, 4) from its frame, at its upper joint, to W [mm]; at the origin where no place is ever known.
 
-    NaN, all of it, where the segment or one from which it hangs has no orientation or was bridged: a transform has one
-    mark of reliability.
+    NaN where the segment or, if its place is known, one from which it hangs has no orientation or was bridged.
     """
     pose, model = motion.pose, motion.model
-    segments = list(pose.quat_WL)
-    if not segments:
-        return {}
     known = {
         segment: np.isfinite(quat).all(axis=1) & ~pose.gap.get(segment, np.zeros(len(quat), dtype=bool))
         for segment, quat in pose.quat_WL.items()
     }
-    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
-    quat_WL = {segment: np.where(known[segment][:, None], quat, no_turn) for segment, quat in pose.quat_WL.items()}
-    placed = set(find_known_links(model, segments))
-    links = [model.table.segments[segment].link for segment in segments]
+    quat_WL = {segment: np.where(known[segment][:, None], quat, IDENTITY) for segment, quat in pose.quat_WL.items()}
+    placed, transforms = set(find_known_links(model, list(quat_WL))), dict[str, np.ndarray]()
+    links = [model.table.segments[segment].link for segment in quat_WL]
     _, p_W = compute_link_poses(model, solve_configuration(model, quat_WL), links, rotations=False)
-    transforms = {}
-    for k, (segment, link) in enumerate(zip(segments, links, strict=True)):
+    for k, (segment, quat) in enumerate(quat_WL.items()):
         T = np.tile(np.eye(4), (len(pose.time), 1, 1))
-        T[:, :3, :3] = Rotation.from_quat(quat_WL[segment]).as_matrix()
+        T[:, :3, :3] = Rotation.from_quat(quat).as_matrix()
         good, above = known[segment], model.parents.get(segment)
-        if link in placed:
+        if links[k] in placed:
             T[:, :3, 3] = 1e3 * p_W[:, k]
             while above is not None:  # on which its place hangs
                 good, above = good & known.get(above, True), model.parents.get(above)

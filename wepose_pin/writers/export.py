@@ -24,16 +24,18 @@ from ..recording import select_interval
 from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
-from .joint_motion import (
+from .lerobot import write_lerobot
+from .motion import (
     ROBOT_URDF,
     TRAJECTORY,
     HasJointMotion,
+    Motion,
+    check_rate,
     convert_person,
     read_joint_motion,
+    resample,
     resample_joints,
 )
-from .lerobot import write_lerobot
-from .motion import Motion, check_rate, resample
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import data_folder, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result, write_table

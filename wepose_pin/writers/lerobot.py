@@ -18,8 +18,7 @@ import polars as pl
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption, WrongOption, how_to_install, one_of
-from .joint_motion import REPETITIONS, JointMotion
-from .motion import is_even
+from .motion import REPETITIONS, JointMotion, is_even
 from .result import write_table
 
 STATE, ACTION = "observation.state", "action"

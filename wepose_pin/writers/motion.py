@@ -1,20 +1,39 @@
-"""The motion to export: a pose with its body, on even times where a format has only a rate."""
+"""What is exported: a pose with its body, or a URDF with its joints over time, of a person or of a robot."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..angles import NEAR_LOCK, euler
 from ..body import BodyModel
+from ..body.configuration import solve_configuration
 from ..body.kinematics import Pose, compute_pose, find_usual_rate
+from ..body.links import compute_joint_values
+from ..body.tree import joint_axis, joint_placement, parse_tree
+from ..body.urdf import read_urdf
+from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, WrongOption
+from ..errors import BadData, MissingFile, WrongOption
+from ..libraries import library_errors
+from ..recording import Intervals, select_interval
+from ..rotations import multiply
+from .result import read_phases
 
+TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
+REPETITIONS = "repetitions"  # in the summary of a trajectory, and as the name of what makes episodes
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
 SLACK_S = 1e-6  # [s] by which times that are written with digits differ
+_ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
@@ -57,16 +76,11 @@ def resample_evenly(motion: Motion) -> Motion:
 def resample(motion: Motion, rate_hz: float) -> Motion:
     """Return the motion at another rate: orientations by the shortest way between two samples, points from the body.
 
-    No filter comes before: what is faster than half the new rate is folded.
-
-    Raises
-    ------
-    BadData
-        An orientation is not known.
+    No filter comes before: what is faster than half the new rate is folded. `BadData` is raised where an orientation
+    is not known.
     """
     check_complete(motion, "resampling")
-    pose = motion.pose
-    old = pose.time
+    pose, old = motion.pose, motion.pose.time
     time = np.minimum(make_times(old, rate_hz), old[-1])
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])
@@ -101,21 +115,15 @@ def check_complete(motion: Motion, format_name: str) -> None:
 
 def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
     """List the segments with gaps, where a format has no way to mark them."""
-    gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items()}
-    unmarked = {"variant": "unmarked"}
     return [
-        Diagnostic("samples-lost", WARNING, segment, count, facts=unmarked) for segment, count in gaps.items() if count
+        Diagnostic("samples-lost", WARNING, segment, int(np.count_nonzero(gap)), facts={"variant": "unmarked"})
+        for segment, gap in motion.pose.gap.items()
+        if gap.any()
     ]
 
 
 def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
-    """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged over a gap.
-
-    Raises
-    ------
-    BadData
-        No point is known.
-    """
+    """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged; `BadData`: none is known."""
     pose = motion.pose
     if not pose.points:
         first = motion.model.table.reference
@@ -127,3 +135,240 @@ def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
         lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]
         points[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
     return points
+
+
+# Joints ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """A motion by the joints of a URDF."""
+
+    name: str  # of the recording of a person, of the robot
+    where: str  # the result's folder, for error texts
+    robot: Any  # the URDF as yourdfpy has it
+    urdf: str  # its text
+    joints: tuple[str, ...]  # names of those that move
+    time: np.ndarray  # (n,) [s]
+    position: np.ndarray  # (n, joints) [rad or m]
+    velocity: np.ndarray  # (n, joints) [rad/s or m/s]
+    posture: Mapping[str, float]  # joint that stays → its value; zero where not named
+    p_WB: np.ndarray  # (3,) [m] of the root link in W
+    quat_WB: np.ndarray  # (4,) xyzw of the root link in W
+    recorded_time: np.ndarray  # (n,) [s] of the recording at each sample
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # `REPETITIONS` are those of the movement
+    begin: int = 0  # the first sample after the robot's approach
+    source: str = ""  # name of the recording that a robot follows
+    no_repetitions: str = ""  # why none were found in it
+
+    @property
+    def rate_hz(self) -> float:
+        """The rate of its usual time step."""
+        return find_usual_rate(self.time)
+
+    @cached_property
+    def ordered(self) -> tuple[Any, ...]:
+        """The URDF's joints depth first, in the order of the file, as MuJoCo numbers them."""
+        below = parse_tree(self.robot, self.where).below
+        order, open_joints = list[Any](), list(reversed(below[self.root]))
+        while open_joints:
+            order.append(open_joints.pop())
+            open_joints += reversed(below[order[-1].child])
+        return tuple(order)
+
+    @cached_property
+    def root(self) -> str:
+        """The link without a parent."""
+        return str(parse_tree(self.robot, self.where).root)
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """All joints of one axis that copy no other, also those that stay, in the order of `ordered`."""
+        return tuple(joint.name for joint in self.ordered if joint.type in _ONE_AXIS and joint.mimic is None)
+
+    def values(self, joint: str) -> np.ndarray:
+        """Return the positions (n,) of a joint [rad or m]."""
+        if joint in self.joints:
+            return np.asarray(self.position[:, self.joints.index(joint)])
+        return np.full(len(self.time), self.posture.get(joint, 0.0))
+
+    def rates(self, joint: str) -> np.ndarray:
+        """Return the velocities (n,) of a joint [rad/s or m/s]."""
+        moves = joint in self.joints
+        return np.asarray(self.velocity[:, self.joints.index(joint)]) if moves else np.zeros(len(self.time))
+
+    def samples(self, interval: tuple[float, float]) -> slice:
+        """Return the samples after the approach that follow an interval [s] of the recording."""
+        recorded = self.recorded_time[self.begin :]
+        first, last = np.searchsorted(recorded, [interval[0] - SLACK_S, interval[1] + SLACK_S])
+        # At the end the robot settles while the recording stands still.
+        return slice(self.begin + int(first), self.begin + int(last))
+
+    def cut(self, samples: slice) -> JointMotion:
+        """Return the motion at some samples only."""
+        of_samples = {name: getattr(self, name)[samples] for name in ("time", "position", "velocity", "recorded_time")}
+        return replace(self, **of_samples, begin=0)
+
+    def select(self, interval: tuple[float, float] | None, phase: str | None) -> JointMotion:
+        """Return the part that follows an interval [s] or a phase of the recording; both None: all of it."""
+        phases = {name: spans for name, spans in self.phases.items() if name != REPETITIONS}
+        selected = select_interval(self.recorded_time, phases, interval, phase)
+        if selected is None:
+            return self
+        part = self.cut(self.samples(selected))
+        if len(part.time) < 2:
+            raise BadData(f"{self.where}: follows no {selected[0]:g} to {selected[1]:g} s of the recording")
+        return part
+
+
+@runtime_checkable
+class HasJointMotion(Protocol):
+    """What moves a robot, such as a trajectory of `retarget`."""
+
+    def joint_motion(self) -> JointMotion:
+        """Return the motion."""
+
+
+class LinkTransform(NamedTuple):
+    """A link in its parent link: xyzw (n, 4) and [m] (n, 3), or of one row where it is fixed to it."""
+
+    parent: str
+    quat: np.ndarray
+    p: np.ndarray
+
+    @property
+    def fixed(self) -> bool:
+        return len(self.p) == 1
+
+
+def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
+    """Compute the transform of every link but the root, parents before children."""
+    transforms = {}
+    for joint in motion.ordered:
+        origin = joint_placement(joint)
+        quat, p = Rotation.from_matrix(origin[:3, :3]).as_quat()[None], origin[None, :3, 3]
+        if joint.type in _ONE_AXIS:
+            source, factor, offset = joint.name, 1.0, 0.0
+            if joint.mimic is not None:
+                source, factor, offset = joint.mimic.joint, joint.mimic.multiplier or 1.0, joint.mimic.offset or 0.0
+            along = (factor * motion.values(source) + offset)[:, None] * joint_axis(joint)
+            quat, p = np.repeat(quat, len(along), axis=0), np.repeat(p, len(along), axis=0)
+            if joint.type == "prismatic":
+                p = p + along @ origin[:3, :3].T
+            else:
+                quat = multiply(quat, Rotation.from_rotvec(along).as_quat())
+        transforms[joint.child] = LinkTransform(joint.parent, quat, p)
+    return transforms
+
+
+def compute_link_poses_W(motion: JointMotion) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Compute xyzw (n, 4) and [m] (n, 3) of every link in W, parents before children."""
+    n = len(motion.time)
+    poses = {motion.root: (np.tile(motion.quat_WB, (n, 1)), np.tile(motion.p_WB, (n, 1)))}
+    for link, (parent, quat, p) in compute_link_transforms(motion).items():
+        quat_WP, p_WP = poses[parent]
+        offset = Rotation.from_quat(quat_WP).apply(np.array(np.broadcast_to(p, (n, 3))))
+        poses[link] = (multiply(quat_WP, np.broadcast_to(quat, (n, 4))), p_WP + offset)
+    return poses
+
+
+# Of a robot ----------------------------------------------------------------------------------------------------------
+
+
+def read_joint_motion(folder: Path) -> JointMotion:
+    """Read the trajectory that `wepose retarget` wrote; `MissingFile` or `BadData`: it is none, or is damaged."""
+    file, summary_file, urdf = folder / TRAJECTORY, folder / "summary.json", folder / ROBOT_URDF
+    for path in (file, summary_file, urdf):
+        if not path.is_file():
+            raise MissingFile(f"{folder}: no {path.name} in it; a folder that `wepose retarget` wrote is wanted here")
+    with library_errors(summary_file, "the summary of a trajectory"):
+        summary = json.loads(summary_file.read_text(encoding="utf-8"))
+        joints = tuple(map(str, summary["joints"]))
+        place = np.array([float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")])
+        posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
+        approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
+        repetitions = summary.get(REPETITIONS) or {}
+        spans = tuple((float(begin), float(end)) for begin, end in repetitions.get("spans", ()))
+        phases = read_phases(summary) | {REPETITIONS: spans}
+    columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
+    values = read_columns(read_table(file), columns, str(file), str(file))
+    time = values[:, 0]
+    if not np.isfinite(values).all() or len(time) < 2 or np.any(np.diff(time) <= 0.0):
+        raise BadData(f"{file}: needs two rows at least, a number in each cell, and times that grow")
+    return JointMotion(
+        name=name,
+        where=str(folder),
+        robot=read_urdf(urdf),
+        urdf=urdf.read_text(encoding="utf-8", errors="replace"),
+        joints=joints,
+        time=time,
+        position=values[:, 2 : 2 + len(joints)],
+        velocity=values[:, 2 + len(joints) :],
+        posture=posture,
+        p_WB=place[:3],
+        quat_WB=place[3:] / np.linalg.norm(place[3:]),
+        recorded_time=values[:, 1],
+        phases=phases,
+        begin=int(np.searchsorted(time, approach_s - SLACK_S)),
+        source=source,
+        no_repetitions=str(repetitions.get("reason") or ""),
+    )
+
+
+def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
+    """Return the motion at another rate, on the cubics through positions and velocities."""
+    time = make_times(motion.time, rate_hz)
+    curve = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
+    inside = np.minimum(time, motion.time[-1])
+    return replace(
+        motion,
+        time=time,
+        position=curve(inside),
+        velocity=curve.derivative()(inside),
+        recorded_time=np.interp(inside, motion.time, motion.recorded_time),
+        begin=int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S)),
+    )
+
+
+# Of a person ---------------------------------------------------------------------------------------------------------
+
+
+def convert_person(motion: Motion) -> JointMotion:
+    """Return a person's motion by the joints of the subject's URDF: a spherical joint is three of one axis."""
+    check_complete(motion, "a file of joints")
+    motion = resample_evenly(motion)
+    model, pose = motion.model, motion.pose
+    if free := [child for child in model.joints if child not in model.axes]:
+        raise BadData(f"{motion.where}: link '{free[0]}' hangs on a joint of type floating, which has no axes to state")
+    q = solve_configuration(model, pose.quat_WL) if pose.q is None else pose.q
+    values = compute_joint_values(model.pin, q)
+    for child in model.axes:
+        values |= _split_triple(model, child, q)
+    position = np.stack(list(values.values()), axis=1)
+    return JointMotion(
+        name=motion.name,
+        where=motion.where,
+        robot=model.robot,
+        urdf=model.urdf(),
+        joints=tuple(values),
+        time=pose.time,
+        position=position,
+        velocity=np.gradient(position, pose.time, axis=0),
+        posture={},
+        p_WB=np.zeros(3),
+        quat_WB=np.array([0.0, 0.0, 0.0, 1.0]),
+        recorded_time=pose.time,
+        source=motion.name,
+    )
+
+
+def _split_triple(model: BodyModel, child: str, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Compute the angles (n,) [rad] of the three revolute joints that are one spherical joint of the model."""
+    first, axes = model.pin.idx_qs[model.joints[child]], model.axes[child]
+    last = -1.0 if np.linalg.det(axes) < 0.0 else 1.0  # mirrored axes
+    basis = axes * [[1.0], [1.0], [last]]
+    # R = exp(a1 q1) exp(a2 q2) exp(a3 q3), in coordinates along the axes Rx Ry Rz.
+    quat = np.column_stack([q[:, first : first + 3] @ basis.T, q[:, first + 3]])
+    angles = euler.follow(euler.decompose(quat, "XYZ"), "XYZ", NEAR_LOCK) * [1.0, 1.0, last]
+    triple = parse_tree(model.robot, child).path(child)[-3:]
+    return {joint.name: angles[:, k] for k, joint in enumerate(triple)}

@@ -54,19 +54,15 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
     `MissingFile` is raised where one cannot be read.
     """
     inputs: dict[str, Path] = {}
-    options: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in ("out", "force"):
-            continue
-        several = list(value) if isinstance(value, tuple) and all(isinstance(each, Path) for each in value) else []
+    options = {name: value for name, value in values.items() if name not in ("out", "force")}
+    for name, value in list(options.items()):
+        several = value if isinstance(value, tuple) else (value,)
         # A text may name a file, as that of --protocol.
-        is_path = isinstance(value, Path) or (isinstance(value, str) and value.endswith((".toml", ".urdf")))
-        if several:
-            inputs |= {f"{name}.{i}": path for i, path in enumerate(several)}
-        elif is_path and Path(value).exists():
-            inputs[name] = Path(value)
-        else:
-            options[name] = value
+        paths = [each for each in several if isinstance(each, Path) or str(each).endswith((".toml", ".urdf"))]
+        if paths and len(paths) == len(several) and all(Path(path).exists() for path in paths):
+            names = [name] if value is several[0] else [f"{name}.{i}" for i in range(len(paths))]
+            inputs |= {each: Path(path) for each, path in zip(names, paths, strict=True)}
+            del options[name]
     return {
         "format": FORMAT,
         "command": command,
@@ -79,10 +75,7 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
 
 
 def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
-    """Compute SHA-256 of all that an input consists of (`list_files`), by its name relative to the input's folder.
-
-    `MissingFile` or `BadData` is raised where a file is missing, or cannot be read.
-    """
+    """Compute SHA-256 of all that an input consists of (`list_files`), by its name relative to the input's folder."""
     top = path if path.is_dir() else path.parent
     hashes = {}
     for file in list_files(path, truth):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
@@ -48,7 +47,7 @@ def write_result(
     torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a recording that was tracked as a whole into an existing folder: `write_poses` and `write_about`."""
+    """Write a recording that was tracked as a whole into an existing folder."""
     write_poses(folder, [tracked])
     write_about(folder, tracked, summary, torques, provenance)
 
@@ -71,16 +70,11 @@ def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = 
         if len(files) == 1:
             files[0].rename(folder / name)
             continue
-        try:
-            with contextlib.ExitStack() as stack:
-                out = stack.enter_context((folder / name).open("wb"))
-                # Of a path polars takes [ and * for a pattern, and only UTF-8.
-                opened: list[IO[bytes]] = [stack.enter_context(file.open("rb")) for file in files]
-                pl.scan_parquet(opened).sink_parquet(out, row_group_size=ROW_GROUP)
-        except pl.exceptions.PolarsError as error:
-            if number := re.search(r"\(os error (\d+)\)", str(error)):  # polars has the system's error as text
-                raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
-            raise
+        with contextlib.ExitStack() as stack:
+            out = stack.enter_context((folder / name).open("wb"))
+            # Of a path polars takes [ and * for a pattern, and only UTF-8.
+            opened: list[IO[bytes]] = [stack.enter_context(file.open("rb")) for file in files]
+            pl.scan_parquet(opened).sink_parquet(out, row_group_size=ROW_GROUP)
         for file in files:
             file.unlink()
 
@@ -144,14 +138,8 @@ def read_result(
 ) -> tuple[Pose, BodyModel, dict[str, Any]]:
     """Pose, body and summary of a result folder; the body with the subject's lengths and girdles.
 
-    Parameters
-    ----------
-    interval, phase : of the pose, only this interval [s] or this phase of the recording (`select_interval`)
-
-    Raises
-    ------
-    WeposeError
-        It is no result folder, or its files are damaged; the interval or the phase is not in the recording.
+    `interval`, `phase`: of the pose, only this interval [s] or this phase of the recording. `WeposeError` is raised
+    where it is no result folder, a file is damaged, or the interval or phase is not in the recording.
     """
     if not (folder / "pose.parquet").is_file():
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
@@ -235,8 +223,7 @@ def versions() -> dict[str, str]:
 
 def as_json(value: Any) -> Any:
     """Named tuples and arrays as JSON values."""
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {key: as_json(item) for key, item in value._asdict().items()}
+    value = value._asdict() if hasattr(value, "_asdict") else value
     if isinstance(value, dict):
         return {key: as_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadOption, how_to_install
-from .joint_motion import JointMotion, LinkTransform, compute_link_transforms
+from .motion import JointMotion, LinkTransform, compute_link_transforms
 
 FIXED_FRAME = "map"
 TYPES = {

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from ..body.urdf import Mesh, Visual, list_visuals, package_folders, reduce_triangles, triangulate
 from ..errors import BadOption, how_to_install, native_stderr_muted
-from .joint_motion import ROBOT_URDF, JointMotion, compute_link_poses_W
+from .motion import ROBOT_URDF, JointMotion, compute_link_poses_W
 
 TIMELINE = "time"
 APPLICATION = "wepose"
