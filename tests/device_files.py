@@ -393,7 +393,7 @@ def mvnx(
         lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
         lines.append(f"<orientation>{' '.join(f'{value:.9f}' for value in quats.ravel())}</orientation>")
         if raw:
-            lines.append("<sensorAcceleration>0 0 9.81 0 9.81 0</sensorAcceleration>")
+            lines.append(f"<sensorAcceleration>{1e-3 * (k % 3)} 0 9.81 {1e-3 * (k % 2)} 9.81 0</sensorAcceleration>")
             lines.append(f"<sensorAngularVelocity>{0.1 + 1e-4 * (k % 2)} 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
         lines.append("</frame>")
     (folder / "trial.mvnx").write_text("\n".join([*lines, end]), encoding="utf-8")
