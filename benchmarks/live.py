@@ -19,10 +19,10 @@ import numpy as np
 
 from wepose_pin.live import Output, SensorSetup, Status, run_session
 from wepose_pin.live.outputs import UdpOutput
-from wepose_pin.live.robot import RobotOptions, RobotOutput, connect_robot
+from wepose_pin.live.robot import RobotOutput
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import Recording
-from wepose_pin.retargeting import find_map, load_robot
+from wepose_pin.retargeting import CommandStream, find_map, load_robot
 from wepose_pin.simulation import simulate, simulate_person
 
 from .tables import Column, Section, Table
@@ -119,8 +119,7 @@ def measure_live_session(seconds: float) -> Table:
 def _connect_robot(recording: Recording, folder: Path) -> RobotOutput:
     """The output for an arm of seven joints, that of the tests."""
     write_arm = importlib.import_module("tests.arms").write_arm
-    options = RobotOptions(load_robot(find_map(str(write_arm(folder)))), to="9")
-    robot = connect_robot(options, tuple(recording.sensors))
+    robot = RobotOutput(CommandStream(load_robot(find_map(str(write_arm(folder))))), "9", tuple(recording.sensors))
     robot.open()
     return robot
 

@@ -165,7 +165,7 @@ def live(
     from ..live.encoder import RobotFigure
     from ..live.guide import GuideOptions, choose_protocol
     from ..live.loop import warm_up
-    from ..live.robot import connect_robot, read_robot
+    from ..live.robot import RobotOutput, read_robot
     from ..live.setup import build_subject_model, check_mounts
     from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView
@@ -178,9 +178,9 @@ def live(
     senders = [f"{name}:{value}" for name, value in usual.items() if value is not None] + list(output or ())
     announce_compilation()  # a stream is waiting
     # A wrong robot is found before the person does anything.
-    robot_options = None if robot is None else read_robot(robot)
-    if robot_options is not None and guide:
-        check_person_arms(robot_options.robot, load_protocol(protocol or GUIDED).needs)
+    commands, receiver = (None, "") if robot is None else read_robot(robot)
+    if commands is not None and guide:
+        check_person_arms(commands.robot, load_protocol(protocol or GUIDED).needs)
     if subject is not None and not accept_failed:
         load_subject(subject).check_quality()
     replays = source.startswith("replay:")
@@ -218,10 +218,10 @@ def live(
                     return Live(None, None)
                 (samples, worn), record = guided, record or _name_recording(folder)
                 body = build_subject_model(worn, samples.sensors)
-            if robot_options is not None:
+            if commands is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
-                driven = connect_robot(robot_options, samples.sensors, worn.subject, factor, body.table)
-                if not driven.stream.checks_contact:
+                driven = RobotOutput(commands, receiver, samples.sensors, worn.subject, body.table, factor)
+                if not commands.checks_contact:
                     print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
             if served is not None and driven is not None:
                 served.set_body(body, RobotFigure(driven.robot, body, driven.read_position))

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
 from ..body.kinematics import KinematicsSolver
-from ..body.subject import Subject, population_subject
+from ..body.subject import Subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
 from ..errors import BadOption
@@ -79,32 +79,29 @@ class GuideOptions:
         """Lengths that the person need not measure, `STATURE` among them where it is known."""
         return {*self.measured, *([STATURE] if self.stature is not None or self.subject is not None else [])}
 
-    def estimate(self, recording: Recording) -> Calibration:
-        """Calibrate the recording so far."""
-        prior = self._earlier or population_subject(self.stature, self.sex, self.model)
-        parts = choose_parts(self.protocol, recording.phases)
+    def estimate(self, recording: Recording, entered: Mapping[str, float] | None = None) -> Calibration:
+        """Calibrate a recording, with lengths [m] that the person has `entered`."""
+        lengths = {**self.measured, **(entered or {})}
         return calibrate(
-            recording, measured=self.measured, prior=prior, model=self.model, protocol=parts, method=self.method
-        )
-
-    def calibrate(self, path: Path, entered: Mapping[str, float]) -> Calibration:
-        """Calibrate a recording with lengths [m] that the person `entered`, and save it to a folder beside the file."""
-        from ..report.calibration import write_calibration_page
-        from ..writers.calibration import write_calibration
-        from ..writers.provenance import collect_provenance, result_folder
-
-        lengths, recording = {**self.measured, **entered}, load_session(path)
-        parts, folder = choose_parts(self.protocol, recording.phases), path.with_suffix("")
-        calibration = calibrate(
             recording,
             measured={name: value for name, value in lengths.items() if name != STATURE},
             prior=self._earlier,
             stature=lengths.get(STATURE, self.stature),
             sex=self.sex,
-            protocol=parts,
+            protocol=choose_parts(self.protocol, recording.phases),
             method=self.method,
         )
-        stated = {"session": path, "protocol": parts, "measured": lengths, "prior": self.subject, "method": self.method}
+
+    def calibrate(self, path: Path, entered: Mapping[str, float]) -> Calibration:
+        """Calibrate the recording in a file as `estimate`, and save the result to a folder beside it."""
+        from ..report.calibration import write_calibration_page
+        from ..writers.calibration import write_calibration
+        from ..writers.provenance import collect_provenance, result_folder
+
+        recording, folder = load_session(path), path.with_suffix("")
+        calibration, measured = self.estimate(recording, entered), {**self.measured, **entered}
+        stated = {"session": path, "measured": measured, "prior": self.subject, "method": self.method}
+        stated["protocol"] = choose_parts(self.protocol, recording.phases)
         with result_folder(folder, force=True) as partial:
             write_calibration(partial, calibration, collect_provenance("calibrate", stated))
         write_calibration_page(folder, calibration, recording, method=self.method)
@@ -206,7 +203,7 @@ class Guide(Stage):
 
     def process(self, samples: list[Samples]) -> None:
         self.now, self.samples, self.ticks = self.source.clock(), samples, []
-        self.monitor.push(samples, self.source.orientations)
+        self.monitor.push(samples)
         if self.attempt is not None:
             self._postponed += samples
             if self.step.records:
@@ -290,7 +287,7 @@ class Guide(Stage):
 
     def build_status(self) -> Status:
         sensors = []
-        for name, known in sorted(self.monitor.update(self.now).items()):
+        for name, known in sorted(self.monitor.update(self.now, self.source.orientations).items()):
             segment = self.segments.get(name, name)
             label = name if segment == name else f"{segment} ({name})"
             sensors.append(known._replace(segment=label, lost=name in self.silent))

@@ -147,7 +147,7 @@ class LiveLoop(Stage):
                 output.close()
         counts = {}
         for name, row in zip(self.source.sensors, self._read_counts().tolist(), strict=True):
-            counts[name] = dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.count_missing(name)}
+            counts[name] = dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.missing[name]}
         return SessionSummary(
             self._poses,
             self._last_pose - self._first_pose,
@@ -162,7 +162,7 @@ class LiveLoop(Stage):
 
     def process(self, samples: list[Samples]) -> None:
         pose = None
-        self._monitor.push(samples, self.source.sensors if self._estimator else self.source.orientations)
+        self._monitor.push(samples)
         for ticks in self._stream.push(samples):
             pose = self._track(ticks) or pose
         if self.log is not None:
@@ -277,7 +277,7 @@ class LiveLoop(Stage):
     def build_status(self) -> Status:
         sensors, estimator, clock = self.source.sensors, self._estimator, self._stream.clock
         now, counts = self.source.clock(), self._read_counts()
-        known = self._monitor.update(now)
+        known = self._monitor.update(now, sensors if estimator is not None else self.source.orientations)
         frozen = np.zeros(len(sensors), dtype=bool) if clock is None else clock.frozen.copy()
         lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen
         lost |= False if clock is None else clock.lost

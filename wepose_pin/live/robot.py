@@ -8,7 +8,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +43,9 @@ class RobotOutput(Output):
     Parameters
     ----------
     to : ``PORT`` of this machine, or ``HOST:PORT``
-    lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
+    sensors : of the person, if they are known; `WeposeError` is raised where an arm has none
+    subject, table : whose arms move, None: the population prior's; the body, None: the upper body
     speed : of a replay
-    table : of the person's body; None: the upper body
 
     Attributes
     ----------
@@ -60,14 +59,20 @@ class RobotOutput(Output):
         self,
         stream: CommandStream,
         to: str = str(PORT),
-        *,
-        lengths_cov: np.ndarray | None = None,
-        speed: float = 1.0,
+        sensors: Sequence[str] = (),
+        subject: Subject | None = None,
         table: BodyTable | None = None,
+        speed: float = 1.0,
     ) -> None:
-        self.stream, self.robot = stream, stream.robot
+        if math.isinf(speed):
+            raise BadOption("--speed max: a robot follows a replay at its own speed, or a multiple of it")
+        if sensors:
+            check_person_arms(stream.robot, sensors, table=table)
+        self.stream, self.robot, self._table, self._speed = stream, stream.robot, table, speed
+        self._lengths_cov = (subject or population_subject(body=table)).lengths_covariance(
+            (table or load_table()).lengths
+        )
         self._sender = UdpSender(to, "to =", PORT)
-        self._lengths_cov, self._table, self._speed = lengths_cov, table, speed
         self._observer: ArmObserver | None = None
         self._newest: tuple[float, LivePose] | None = None  # with its time of arrival [s]
         self._taken: LivePose | None = None
@@ -174,27 +179,18 @@ class RobotOutput(Output):
         return command
 
 
-@dataclass(frozen=True)
-class RobotOptions:
-    """A robot that follows."""
-
-    robot: Robot  # of `load_robot`
-    to: str = str(PORT)  # ``PORT`` or ``HOST:PORT`` of the receiver
-    stream: StreamOptions = field(default_factory=StreamOptions)
-
-
 MARGINS, TIMING = ("speed_scale", "limit_margin"), ("rate_hz", "hold_after", "stop_after")
 
 
-def read_robot(name: str) -> RobotOptions:
-    """The robot that ``--robot`` names, and how it follows; raises `WeposeError`.
+def read_robot(name: str) -> tuple[CommandStream, str]:
+    """Commands for the robot that ``--robot`` names, and their receiver, as of `RobotOutput`; raises `WeposeError`.
 
     `name` is as of `find_map`, or a TOML file whose key `robot` is such a name and whose other keys say the rest.
     """
     file = Path(name)
     values = read_toml(file, "a robot", BadOption) if file.suffix == ".toml" and file.is_file() else {}
     if "robot" not in values:
-        return RobotOptions(load_robot(find_map(name)))
+        return CommandStream(load_robot(find_map(name))), str(PORT)
     keys = TomlTable(values, name, error=BadOption)
     keys.allow("robot", "arm", "to", *MARGINS, *TIMING)
     robot = str(keys.text("robot", None))
@@ -205,29 +201,9 @@ def read_robot(name: str) -> RobotOptions:
     sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
     try:
         chosen = load_robot(find_map(str(neighbour) if neighbour.is_file() else robot), sides, LimitMargins(**margins))
-        return RobotOptions(chosen, str(values.get("to", PORT)), StreamOptions(**timing))
+        return CommandStream(chosen, StreamOptions(**timing)), str(values.get("to", PORT))
     except WrongOption as error:
         raise BadOption(f"{name}: {error.name.replace('-', '_')} = {error.value}: {error.needed}") from None
-
-
-def connect_robot(
-    options: RobotOptions,
-    sensors: Sequence[str],
-    subject: Subject | None = None,
-    speed: float = 1.0,
-    table: BodyTable | None = None,
-) -> RobotOutput:
-    """The robot's output, not opened; raises `WeposeError` where an arm has no `sensors`, if these are known.
-
-    `subject` None is the population prior, `table` None the upper body, `speed` that of a replay.
-    """
-    if math.isinf(speed):
-        raise BadOption("--speed max: a robot follows a replay at its own speed, or a multiple of it")
-    if sensors:
-        check_person_arms(options.robot, sensors, table=table)
-    lengths_cov = (subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)
-    stream = CommandStream(options.robot, options.stream)
-    return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed, table=table)
 
 
 def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:

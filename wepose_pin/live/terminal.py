@@ -60,16 +60,14 @@ class TerminalView(Output):
         action = self._typing
         if action is None:
             action = next((each for each in self._actions if each.key == key.lower()), None)
-            if action is None:
-                return QUIT if key in "qQ" else None
-            if not action.entry:
+            if action is not None and not action.entry:
                 return Request(action.name)
             self._typing, self._typed = action, ""
-        elif key in RETURN or key == ESCAPE:
+            return QUIT if action is None and key in "qQ" else None
+        if key in RETURN or key == ESCAPE:
             self._typing = None
             return Request(action.name, self._typed.strip()) if key in RETURN else None
-        else:
-            self._typed = self._typed[:-1] if key in ERASE else self._typed + key * key.isprintable()
+        self._typed = self._typed[:-1] if key in ERASE else self._typed + key * key.isprintable()
         return None
 
     def close(self) -> None:
@@ -78,14 +76,13 @@ class TerminalView(Output):
 
     def _list_changes(self, status: Status, time_s: str) -> list[str]:
         """A line for each state that differs from the last one reported; another number in a sentence is no change."""
-        sentence = _describe_state(status)
-        states = {"": (re.sub(r"[0-9.]+", "", sentence), time_s + sentence)}  # what → its state, and the line
+        sentence, reasons = _describe_state(status), () if status.guide is None else status.guide.reasons
+        line = "\n    ".join([time_s + sentence, *reasons])
+        states = {"": (re.sub(r"[0-9.]+", "", sentence), line)}  # what → its state, and the line
         for each in status.sensors:
             state = "lost" if each.lost else "there"
             states[each.segment] = state, f"{time_s}{each.segment}: {state}"
         states |= {problem: ("now", f"{time_s}{problem}: since now") for problem, n in status.problems.items() if n}
-        if status.guide is not None:
-            states[""] = states[""][0], "\n    ".join([states[""][1], *status.guide.reasons])
         if self._keyboard is not None and status.state != "ended":
             keys = ", ".join([*(f"{each.key} {each.label}" for each in status.actions), "q end"])
             states["keys"] = keys, f"    keys: {keys}"
@@ -103,7 +100,7 @@ class TerminalView(Output):
             parts += [] if guide.remaining is None else [f"{guide.remaining:.0f} s left"]
             parts += [f"{100.0 * guide.progress:.0f} %", guide.sentence]
         if status.state == "ready":
-            parts.append(f"latency {status.latency_ms[0]:.1f} ms (p50), {status.latency_ms[1]:.1f} ms (p99)")
+            parts.append("latency {:.1f} ms (p50), {:.1f} ms (p99)".format(*status.latency_ms))
         if status.recorded_s:
             parts.append(f"recording {status.recorded_s:.0f} s")
         return "  ".join(parts)

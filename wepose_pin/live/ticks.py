@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -22,55 +22,27 @@ from .sources.base import Source
 from .state import SensorStatus, join_names
 
 UNIT_WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
-FIRST_SAMPLES = 50  # by which a sensor's step is measured
-JUMP_S = 60.0  # [s] between two samples from which on the clock was set and nothing is known
+TRACKED_WINDOW_S = 1.0  # [s] in place of that window where the unit is known
+OVERTAKEN_S = 0.5  # [s] after which a sample that has not come counts as missing
+SILENT_STEP_S = 0.25  # [s] a longer step is a silence
+JUMP_S = 60.0  # [s] between two samples, from which on the clock was set
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate of the ticks is measured if the source does not know it
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
 BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
 
 
-class SampleCounter:
-    """Counts the samples of one sensor, and by the steps between their times those that never came."""
-
-    def __init__(self) -> None:
-        self.missing, self.newest = 0, -math.inf  # samples; time [s]
-        self.last_second: deque[float] = deque()  # times [s] of the samples in the second that ends at the last one
-        self._first: list[float] = []  # times [s], until the step is known
-        self._step = math.inf  # [s]
-
-    def push(self, time_s: np.ndarray) -> None:
-        """Take the times (m,) [s] of samples in their order of arrival."""
-        times = time_s.tolist()
-        if len(self._first) < FIRST_SAMPLES:
-            self._first += [t for t in times if math.isfinite(t)]
-            if len(self._first) >= FIRST_SAMPLES:
-                self._step = measure_step(np.array(self._first)) or math.inf
-                times, self.newest = self._first, self._first[0]
-                self.last_second.clear()
-        for t in times:
-            if not math.isfinite(t):
-                continue
-            step = t - self.newest
-            self.last_second.append(t)
-            while not 0.0 <= t - self.last_second[0] < 1.0:  # older, or of before the clock was set back
-                self.last_second.popleft()
-            if -JUMP_S < step < 0.0:  # it was overtaken, and taken for a lost one
-                self.missing -= self.missing > 0
-                continue
-            self.missing += max(0, round(step / self._step) - 1) if step < JUMP_S else 0
-            self.newest = t
-
-
 def measure_step(time_s: np.ndarray) -> float:
     """Measure the step [s] between times (n,) of which some are missing; 0: none can be measured."""
     steps = np.diff(np.unique(time_s))
+    steps = steps[steps < SILENT_STEP_S]
     if len(steps) < 2:
         return 0.0
     median, mean = float(np.median(steps)), float(steps.mean())
     count = np.rint(steps / median)
-    is_even = mean < 3.0 * median and np.sqrt(np.mean((steps / median - count) ** 2)) < 0.2
-    return float(steps.sum() / count.sum()) if is_even else mean  # else time stamps come in bursts, or jitter
+    step = float(steps.sum() / count.sum())
+    is_even = mean < 3.0 * median and np.sqrt(np.mean((steps / step - count) ** 2)) < 0.25
+    return step if is_even else mean  # else time stamps come in bursts, or jitter
 
 
 class SensorMonitor:
@@ -78,55 +50,56 @@ class SensorMonitor:
 
     def __init__(self, source: Source) -> None:
         self.wrong_unit = ""  # a sentence on sensors whose rates contradict gravity; empty: there is none
+        self.sending: dict[str, float] = {}  # sensor that has sent something → time [s] of its newest sample
+        self.missing = Counter[str]()  # samples that never came
         self._source = source
-        self.sending: dict[str, SampleCounter] = {}  # of the sensors that have sent something
         self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
-        self._recent: dict[str, list[Samples]] = {}  # of which rates are compared with gravity
+        self._counted: dict[str, float] = {}  # sensor → time [s] of the sample up to which they are counted
+        self._recent: dict[str, list[Samples]] = {}
 
-    def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
-        """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
+    def push(self, samples: Iterable[Samples]) -> None:
+        """Take samples in their order of arrival."""
         for chunk in samples:
-            self.sending.setdefault(chunk.sensor, SampleCounter()).push(chunk.time)
+            self._recent.setdefault(chunk.sensor, []).append(chunk)
             self._arrived[chunk.sensor] = self._source.clock()
-            if chunk.sensor in unchecked:
-                self._recent.pop(chunk.sensor, None)
-            else:
-                self._recent.setdefault(chunk.sensor, []).append(chunk)
-
-    def count_missing(self, sensor: str) -> int:
-        """Samples of a sensor that never came."""
-        return self.sending[sensor].missing if sensor in self.sending else 0
+            self.sending[chunk.sensor] = float(chunk.time[-1])
 
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
         """The sensors without a sample for longer than `silence_s` [s]."""
-        sending = self.sending
-        return [name for name in sensors if name not in sending or now - sending[name].newest > silence_s]
+        return [name for name in sensors if now - self.sending.get(name, -math.inf) > silence_s]
 
-    def update(self, now: float) -> dict[str, SensorStatus]:
-        """Rate over each sensor's last second, missing samples and battery; looks for a wrong unit as well."""
-        self.wrong_unit, statuses = self._find_wrong_unit(), {}
-        for name, counter in self.sending.items():
-            rate_hz = float(len(counter.last_second)) if now - self._arrived[name] < 1.0 else 0.0
-            battery = self._source.batteries.get(name, math.nan)
-            statuses[name] = SensorStatus(name, rate_hz, missing=counter.missing, battery=battery)
-        return statuses
+    def update(self, now: float, unchecked: Collection[str] = ()) -> dict[str, SensorStatus]:
+        """Rate over each sensor's last second, missing samples and battery; looks for a wrong unit as well.
 
-    def _find_wrong_unit(self) -> str:
-        rates = {}
-        for sensor, recent in self._recent.items():
+        The unit of the `unchecked` sensors is not watched.
+        """
+        statuses, wrong = {}, {}
+        for name, recent in self._recent.items():
             time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*recent, strict=True))[1:])
-            newest = float(np.max(time_s, where=np.isfinite(time_s), initial=-np.inf))
-            rows = time_s > newest - UNIT_WINDOW_S
-            recent[:] = [Samples(sensor, time_s[rows], gyro_S[rows], accel_S[rows])]
-            span_s = newest - float(np.min(time_s, where=rows, initial=newest))
-            if span_s > 0.9 * UNIT_WINDOW_S:
+            newest = next((t for t in time_s[::-1].tolist() if math.isfinite(t)), math.nan)
+            window_s = TRACKED_WINDOW_S if name in unchecked else UNIT_WINDOW_S
+            counted = self._counted.setdefault(name, newest)
+            rows = (time_s >= min(newest - window_s, counted)) & (time_s < newest + 1.0)
+            recent[:] = [Samples(name, time_s[rows], gyro_S[rows], accel_S[rows])]
+            times = np.unique(time_s[rows])
+            steps, step = np.diff(times), measure_step(times) or math.inf
+            done = times[1:] <= newest - OVERTAKEN_S
+            new = done & (times[1:] > counted) & (steps < JUMP_S)
+            self.missing[name] += int(np.maximum(np.rint(steps[new] / step) - 1.0, 0.0).sum())
+            self._counted[name] = float(times[1:][done][-1]) if done.any() else counted
+            rate_hz = float(np.count_nonzero(time_s > newest - 1.0)) if now - self._arrived[name] < 1.0 else 0.0
+            battery = self._source.batteries.get(name, math.nan)
+            statuses[name] = SensorStatus(name, rate_hz, missing=self.missing[name], battery=battery)
+            span_s = float(np.ptp(times)) if len(times) else 0.0
+            if name not in unchecked and span_s > 0.9 * UNIT_WINDOW_S:
                 rate = find_unseen_rate(gyro_S[rows], accel_S[rows], (np.count_nonzero(rows) - 1) / span_s)
                 if math.isfinite(rate):
-                    rates[sensor] = rate
-        if not rates:
-            return ""
-        what = f"rates of {max(rates.values()):.2g} rad/s while gravity does not turn: deg/s?"
-        return f"{join_names(list(rates))}: {what} {self._source.explain_unit('gyro_unit', 'deg/s')}."
+                    wrong[name] = rate
+        self.wrong_unit = ""
+        if wrong:
+            what = f"rates of {max(wrong.values()):.2g} rad/s while gravity does not turn: deg/s?"
+            self.wrong_unit = f"{join_names(list(wrong))}: {what} {self._source.explain_unit('gyro_unit', 'deg/s')}."
+        return statuses
 
 
 def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
