@@ -77,7 +77,7 @@ def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float,
         for name in robots:
             begin = time.process_time()
             with contextlib.redirect_stdout(io.StringIO()):
-                summary = retarget(result, robot=name, out=Path(folder) / name, interval=interval, view=False).summary
+                summary = retarget(result, robot=name, out=Path(folder) / name, interval=interval, view=False).result
             wall = time.process_time() - begin
             common = _name_margins(summary["limit_margins"]) | {
                 "infeasible": 100.0 * summary["steps"]["stopping_share"],

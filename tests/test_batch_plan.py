@@ -127,7 +127,7 @@ HEAD = '[sessions]\nfiles = "anna/*"\n'
         (f'{HEAD}[subjects.anna]\nfile = "a"\ncalibration = "b"\n[steps.track]', "not both"),
         (f'{HEAD}[subjects.a]\nfile = "nobody"\n[steps.track]', "nobody: no such file"),
         (f"{HEAD}[subjects.a]\nmeasured = {{ arm = 1 }}\n[steps.track]", "measured.arm is not a known"),
-        (f"{HEAD}[subjects.a]\nstature = 170\n[steps.track]", "stature = 170; a number from 1 to 2.5 is needed"),
+        (f"{HEAD}[subjects.a]\nstature = 170\n[steps.track]", "subjects.a: stature 170 is not a body height"),
     ],
 )
 def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: str) -> None:
@@ -143,7 +143,7 @@ def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: st
     [
         ("sesion\na", "row 1: session is empty; the columns are sesion"),
         ("session,age\na,3", "row 1.age is not a known key"),
-        ("session,stature\na,178", "row 1.stature = 178.0; a number from 1 to 2.5 is needed"),
+        ("session,stature\na,178", "row 1: stature 178 is not a body height"),
         ("session,name\na,x\nb,x", "row 2: 'x' names two items"),
         ("session\na\na", "row 2: 'a' names two items"),
     ],

@@ -111,7 +111,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert "low-passed at 6 Hz" in printed
     tables = read_tables(out)
     assert set(tables) == {
-        *("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison", "definitions"),
+        *("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison"),
     }
     assert tables["sessions"].select("session", "n", "low_pass_hz").rows() == [("before", 7, 6.0), ("after", 7, 6.0)]
     elbow = (pl.col("joint") == "right_elbow") & (pl.col("angle") == "flexion")
@@ -174,7 +174,7 @@ def test_where_nothing_repeats_there_are_phases_all_the_same(
     assert run("angles", results[0], "-o", tmp_path / "a", "--phase", "start") == 0
     assert "no repetitions by right_elbow_flexion: the angle goes out and back" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "a").iterdir()} == {
-        *("angles.csv", "sessions.csv", "phases.csv", "definitions.csv", "repetitions.svg", "angles.svg"),
+        *("angles.csv", "sessions.csv", "phases.csv", "repetitions.svg", "angles.svg"),
         *("angles.html", "provenance.json"),
     }
     assert "goes out and back" in (tmp_path / "a" / "angles.html").read_text(encoding="utf-8")

@@ -239,7 +239,6 @@ def test_the_commands(
     assert "Mounts" not in captured.out
     content = json.loads((tmp_path / "anna" / "calibration.json").read_text())
     assert content["provenance"]["options"]["formulation"] == "paper"
-    assert "output-incomplete" not in {each["code"] for each in content["diagnostics"]}
     assert load_subject(tmp_path / "anna").mounts == {}
     assert {values[0] for values in load_subject(tmp_path / "anna").girdles.values()} == {-1.0}  # fixed shoulders
     page = (tmp_path / "anna" / "report.html").read_text(encoding="utf-8")

@@ -23,17 +23,8 @@ from . import euler
 # of the palm), Y up or proximal, Z to the right (of a forearm and a hand: from the ulna to the radius, the side of the
 # thumb). In the N-pose, palms to the thighs, a forearm is turned by 90° of pronation from the anatomical position, in
 # which all of the ISB's axes are parallel; so are the axes here.
-ISB_AXES = {
-    "world": ("+x", "+z", "-y"),
-    "torso": ("+x", "+z", "-y"),
-    "upper_arm": ("+x", "+z", "-y"),
-    "forearm": ("+y", "+z", "+x"),
-    "hand": ("+y", "+z", "+x"),
-    "pelvis": ("+x", "+z", "-y"),
-    "thigh": ("+x", "+z", "-y"),
-    "shank": ("+x", "+z", "-y"),
-    "foot": ("+x", "+z", "-y"),
-}
+ISB_AXES = dict.fromkeys(("world", "torso", "upper_arm", "pelvis", "thigh", "shank", "foot"), ("+x", "+z", "-y"))
+ISB_AXES |= dict.fromkeys(("forearm", "hand"), ("+y", "+z", "+x"))
 # The axes of both segments of a right knee, by which Grood and Suntay's three angles have their signs: forward, distal,
 # medial.
 KNEE_AXES = ("+x", "-z", "+y")
@@ -46,85 +37,48 @@ _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
 NEAR_LOCK = float(np.radians(10.0))
 MAX_NEAR_LOCK = 0.01  # of the samples: of an angle that is read as a whole
 
-# Sequence of a shoulder's angles → their names and where each is positive. Elevation alone is negative where the arm is
-# raised in the plane of elevation, as the ISB has it.
-_ROTATION = {"internal_rotation": "inward"}
-_ADDUCTION = {"adduction": "arm towards the body (abduction is negative)"}
-SHOULDER_SEQUENCES: dict[str, dict[str, str]] = {
-    "YXY": {  # Wu 2005, 2.4.7
-        "plane_of_elevation": "0° out to the side, 90° forward, −90° backward",
-        "elevation": "on the far side of the plane of elevation; −90° is horizontal in that plane",
-        **_ROTATION,
-    },
-    "XZY": {**_ADDUCTION, "flexion": "arm forward", **_ROTATION},
-    "ZXY": {"flexion": "arm forward", **_ADDUCTION, **_ROTATION},
+# Sequence of a shoulder's angles → their names; docs/angles.md says where each is positive.
+SHOULDER_SEQUENCES = {
+    "YXY": ("plane_of_elevation", "elevation", "internal_rotation"),  # Wu 2005, 2.4.7
+    "XZY": ("adduction", "flexion", "internal_rotation"),
+    "ZXY": ("flexion", "adduction", "internal_rotation"),
 }
 AUTO = "auto"  # the sequence of `choose_shoulder_sequence`
 
 
 class Joint(NamedTuple):
-    """A joint's two segments and its angles."""
+    """A joint's two segments and the names of its angles; empty for the shoulder's choice."""
 
     proximal: str
     distal: str
-    sequence: str  # empty for the shoulder's choice
-    angles: Mapping[str, str]  # name → where it is positive
+    names: tuple[str, ...]
+    sequence: str = "ZXY"
     axes: tuple[str, str, str] | None = None  # X, Y, Z of both segments in our frame of them; None: `ISB_AXES`
 
 
-_ELBOW = {  # Wu 2005, 3.4.1
-    "flexion": "bent",
-    "carrying_angle": "forearm towards the body; the carrying angle of a straight arm is negative",
-    "pronation": "0° palm forward (supinated), 90° thumb forward, 180° palm back",
-}
-_WRIST = {  # 4.4.1
-    "flexion": "towards the palm",
-    "ulnar_deviation": "towards the little finger",
-    "pronation": "as in the forearm",
-}
-_HIP = {  # Wu 2002
-    "flexion": "thigh forward",
-    "adduction": "thigh towards the other (abduction is negative)",
-    "internal_rotation": "inward",
-}
-_KNEE = {  # Grood and Suntay 1983
-    "flexion": "bent",
-    "adduction": "ankle towards the other (bow legs, varus)",
-    "external_rotation": "toes outward",
-}
-_ANKLE = {  # Wu 2002
-    "dorsiflexion": "toes up (plantar flexion is negative)",
-    "inversion": "sole inward",
-    "internal_rotation": "toes inward",
-}
-_THORAX = {  # Wu 2005, 2.4.1
-    "extension": "leaning back (a bow is negative)",
-    "lateral_flexion_right": "leaning to the right",
-    "axial_rotation_left": "turned to the left",
-}
-_PELVIS = {
-    "posterior_tilt": "tilted back (an anterior tilt is negative)",
-    "obliquity_right_down": "the right side down",
-    "axial_rotation_left": "turned to the left",
-}
+_THORAX = ("extension", "lateral_flexion_right", "axial_rotation_left")  # Wu 2005, 2.4.1
+_ELBOW = ("flexion", "carrying_angle", "pronation")  # Wu 2005, 3.4.1
+_WRIST = ("flexion", "ulnar_deviation", "pronation")  # Wu 2005, 4.4.1
+_PELVIS = ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
+_HIP = ("flexion", "adduction", "internal_rotation")  # Wu 2002
+_KNEE = ("flexion", "adduction", "external_rotation")  # Grood and Suntay 1983
+_ANKLE = ("dorsiflexion", "inversion", "internal_rotation")  # Wu 2002
 
-
-JOINTS = {"thorax": Joint("world", "torso", "ZXY", _THORAX)}
+JOINTS = {"thorax": Joint("world", "torso", _THORAX)}
 for _side in ("left", "right"):
     JOINTS |= {
-        f"{_side}_shoulder": Joint("torso", f"{_side}_upper_arm", "", {}),
-        f"{_side}_elbow": Joint(f"{_side}_upper_arm", f"{_side}_forearm", "ZXY", _ELBOW),
-        f"{_side}_wrist": Joint(f"{_side}_forearm", f"{_side}_hand", "ZXY", _WRIST),
+        f"{_side}_shoulder": Joint("torso", f"{_side}_upper_arm", (), ""),
+        f"{_side}_elbow": Joint(f"{_side}_upper_arm", f"{_side}_forearm", _ELBOW),
+        f"{_side}_wrist": Joint(f"{_side}_forearm", f"{_side}_hand", _WRIST),
     }
 # In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
-JOINTS["pelvis_in_world"] = Joint("world", "pelvis", "ZXY", _PELVIS)
+JOINTS["pelvis_in_world"] = Joint("world", "pelvis", _PELVIS)
 for _side in ("left", "right"):
     JOINTS |= {
-        f"{_side}_hip": Joint("pelvis", f"{_side}_thigh", "ZXY", _HIP),
-        f"{_side}_knee": Joint(f"{_side}_thigh", f"{_side}_shank", "ZXY", _KNEE, KNEE_AXES),
-        f"{_side}_ankle": Joint(f"{_side}_shank", f"{_side}_foot", "ZXY", _ANKLE),
+        f"{_side}_hip": Joint("pelvis", f"{_side}_thigh", _HIP),
+        f"{_side}_knee": Joint(f"{_side}_thigh", f"{_side}_shank", _KNEE, axes=KNEE_AXES),
+        f"{_side}_ankle": Joint(f"{_side}_shank", f"{_side}_foot", _ANKLE),
     }
-_WORDS = {"torso": "thorax", "world": "W"}
 
 
 @dataclass(frozen=True)
@@ -195,12 +149,6 @@ def diagnose_lock(angles: Angles) -> list[Diagnostic]:
     return diagnostics
 
 
-def describe_joint(name: str) -> str:
-    """Describe the rotation that a joint's angles are of, as "forearm in upper arm"."""
-    parts = [part.removeprefix("left_").removeprefix("right_") for part in (JOINTS[name].distal, JOINTS[name].proximal)]
-    return " in ".join(_WORDS.get(part, part.replace("_", " ")) for part in parts)
-
-
 def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
     """Joint without its side → side ("left", "right", or its name where it has none) → joint."""
     groups: dict[str, dict[str, str]] = {}
@@ -260,7 +208,7 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY") -> Angles:
     for name, joint in JOINTS.items():
         if joint.distal in pose.quat_WL and (joint.proximal == "world" or joint.proximal in pose.quat_WL):
             if not joint.sequence:
-                joint = joint._replace(sequence=sequence, angles=SHOULDER_SEQUENCES[sequence])
+                joint = joint._replace(sequence=sequence, names=SHOULDER_SEQUENCES[sequence])
             joints[name] = _angles(pose, joint, name.startswith("left_"))
     if not joints:
         raise BadData(
@@ -279,9 +227,9 @@ def choose_shoulder_sequence(pose: Pose) -> str:
     arm that hangs is in its lock.
     """
     shares = dict.fromkeys(SHOULDER_SEQUENCES, 0.0)
-    for sequence, named in SHOULDER_SEQUENCES.items():
+    for sequence, names in SHOULDER_SEQUENCES.items():
         for side in ("left", "right"):
-            joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, angles=named)
+            joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names)
             if {joint.proximal, joint.distal} <= set(pose.quat_WL):
                 near_lock = _angles(pose, joint, side == "left").near_lock
                 shares[sequence] = max(shares[sequence], float(np.mean(near_lock)))
@@ -304,7 +252,7 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
     gimbal, values, quat = (_expand(known, each) for each in (angles.gimbal, values, rotations.unwrap_signs(quat)))
     std = None if std is None else _expand(known, std)
-    return JointAngles(joint.sequence, tuple(joint.angles), values, gimbal, gimbal < NEAR_LOCK, gap, std, quat)
+    return JointAngles(joint.sequence, joint.names, values, gimbal, gimbal < NEAR_LOCK, gap, std, quat)
 
 
 def compute_gradients(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:

@@ -20,15 +20,10 @@ from ..recording import Intervals
 from ..recording.gaps import find_runs
 from ..rotations import unwrap_signs
 from .euler import count_turns
-from .joints import AUTO, JOINTS, SHOULDER_SEQUENCES, Angles, describe_joint, group_sides, joint_angles
+from .joints import AUTO, JOINTS, Angles, joint_angles
 from .repetitions import PERCENT, MeanCurve, Repetitions, compute_mean_curves, find_repetitions
 from .tables import angle_table, compute_summary_std, summarize_joint
 
-SOURCE = (
-    "Wu et al. 2005 (J Biomech 38:981-992) for thorax, shoulder, elbow and wrist, "
-    "Wu et al. 2002 (J Biomech 35:543-548) for pelvis, hip and ankle, "
-    "Grood and Suntay 1983 (J Biomech Eng 105:136-144) for the knee"
-)
 MEASURES = {"lowest": "deg", "highest": "deg", "range": "deg", "peak_rate": "deg_s"}  # units in a file
 # A longer time step than this many usual ones ends a run: the samples on its two sides are filtered apart.
 _LONGEST_STEP = 1.5
@@ -73,18 +68,15 @@ def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], opt
     if options.cutoff_hz is not None:
         pose = smooth_pose(pose, options.cutoff_hz)
     angles = joint_angles(pose, options.sequence)
-    # Intervals that lie in the time of the pose, or exceed it by less than a sample.
     step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 0.0
     begin, end = pose.time[0] - step, pose.time[-1] + step
-    lying = {phase: tuple((a, b) for a, b in spans if a > begin and b < end) for phase, spans in phases.items()}
-    inside = {phase: spans for phase, spans in lying.items() if spans}
+    inside = {phase: tuple((a, b) for a, b in spans if a > begin and b < end) for phase, spans in phases.items()}
     marked = options.phase
     if marked is None:
         repetitions = find_repetitions(angles, options.main_angle, options.rising)
     elif phases.get(marked):
-        reason = "" if marked in inside else f"no interval of the phase {marked} lies in the selected time"
-        spans = np.array(inside.get(marked, ()), dtype=float).reshape(-1, 2)
-        repetitions = Repetitions(spans, marked, reason=reason)
+        reason = "" if inside[marked] else f"no interval of the phase {marked} lies in the selected time"
+        repetitions = Repetitions(np.array(inside[marked], dtype=float).reshape(-1, 2), marked, reason=reason)
     else:
         choices = one_of(phases, marked) if phases else "it has no phases; without --repetitions they are found"
         raise WrongOption("repetitions", marked, f"the recording has no such phase; {choices}")
@@ -141,18 +133,19 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
 # Tables ------------------------------------------------------------------------------------------------------------
 
 
-def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
-    """Say what each angle is: sequence, axis, where it is positive, and the source; left and right alike."""
-    rows: dict[tuple[str, ...], None] = {}
-    for movement in movements:
-        for group, members in group_sides(movement.angles.joints).items():
-            name = next(iter(members.values()))
-            joint, rotation = movement.angles[name], describe_joint(name)
-            positive = JOINTS[name].angles or SHOULDER_SEQUENCES[joint.sequence]
-            for axis, angle in zip(joint.sequence, joint.names, strict=True):
-                rows[group, rotation, joint.sequence, axis, angle, positive[angle], SOURCE] = None
-    names = ["joint", "rotation", "sequence", "axis", "angle", "positive", "source"]
-    return pl.DataFrame(list(rows), schema=names, orient="row")
+def build_tables(movements: Sequence[Movement]) -> dict[str, pl.DataFrame]:
+    """Build all tables, by the names of their files; one without rows is empty."""
+    repetitions = build_repetition_table(movements)
+    summary = build_summary_table(movements, repetitions)
+    return {
+        "angles": build_angle_table(movements),
+        "sessions": build_session_table(movements),
+        "repetitions": repetitions,
+        "phases": build_phase_table(movements),
+        "summary": summary,
+        "curves": build_curve_table(movements),
+        "comparison": build_comparison_table(summary),
+    }
 
 
 def build_angle_table(movements: Sequence[Movement]) -> pl.DataFrame:
@@ -193,35 +186,34 @@ def build_phase_table(movements: Sequence[Movement]) -> pl.DataFrame:
         time = movement.angles.time
         parts = [("all", 1, (float(time[0]), float(time[-1])))]
         parts += [(name, k, span) for name, spans in movement.phases.items() for k, span in enumerate(spans, 1)]
-        about = [
-            {"session": movement.name, "phase": name, "number": k, "from_s": begin, "to_s": end}
-            for name, k, (begin, end) in parts
-        ]
-        tables.append(_join(about, measure_spans(movement.pose, movement.angles, [span for _, _, span in parts])))
+        about = [{"phase": name, "number": k, "from_s": begin, "to_s": end} for name, k, (begin, end) in parts]
+        measures = measure_spans(movement.pose, movement.angles, [span for _, _, span in parts])
+        tables.append(_join(movement.name, about, measures))
     return pl.concat(tables)
 
 
 def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """Build a row an angle in each repetition."""
     tables = []
-    for movement in (movement for movement in movements if len(movement.measures)):
+    for movement in movements:
         about = [
-            {"session": movement.name, "repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
+            {"repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
             for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
         ]
-        tables.append(_join(about, movement.measures))
+        if about:
+            tables.append(_join(movement.name, about, movement.measures))
     return pl.concat(tables) if tables else pl.DataFrame()
 
 
-def _join(about: Sequence[Mapping[str, Any]], measures: pl.DataFrame) -> pl.DataFrame:
+def _join(session: str, about: Sequence[Mapping[str, Any]], measures: pl.DataFrame) -> pl.DataFrame:
     """Put what is known of each span before its measures."""
     spans = pl.DataFrame(about).with_row_index("span").cast({"span": pl.Int64})
-    return spans.join(measures, on="span", maintain_order="left_right").drop("span")
+    joined = spans.join(measures, on="span", maintain_order="left_right").drop("span")
+    return joined.select(pl.lit(session).alias("session"), pl.all())
 
 
-def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
+def build_summary_table(movements: Sequence[Movement], repetitions: pl.DataFrame) -> pl.DataFrame:
     """Build a row an angle of each session: mean and deviation over repetitions, what is stated, and the CMC."""
-    repetitions = build_repetition_table(movements)
     if not len(repetitions):
         return pl.DataFrame()
     columns = [pl.len().alias("repetitions")]
@@ -255,27 +247,22 @@ def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
     return pl.concat(tables) if tables else pl.DataFrame()
 
 
-def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
+def build_comparison_table(summary: pl.DataFrame) -> pl.DataFrame:
     """Compare each further session with the first, a row a measure of each angle that both have."""
-    summary = build_summary_table(movements)
     sessions = summary["session"].unique(maintain_order=True).to_list() if len(summary) else []
     rows: list[dict[str, Any]] = []
     for session in sessions[1:]:
         against, further = (summary.filter(pl.col("session") == each) for each in (sessions[0], session))
         for row in against.join(further, on=("joint", "angle"), maintain_order="left").iter_rows(named=True):
-            # Angles of a session may be a full turn on.
-            shift = sum(row[f"{end}_mean_deg_right"] - row[f"{end}_mean_deg"] for end in ("lowest", "highest"))
-            turns = float(np.nan_to_num(360.0 * np.round(0.5 * shift / 360.0)))
             about = {"session": session, "against": sessions[0], "joint": row["joint"], "angle": row["angle"]}
             for measure, unit in MEASURES.items():
                 parts = ("n", f"mean_{unit}", f"sd_{unit}", f"std_{unit}")
                 n, mean, sd, std = ([row[f"{measure}_{part}{end}"] for end in ("", "_right")] for part in parts)
-                mean[1] -= turns if measure in ("lowest", "highest") else 0.0
                 low, high = compute_interval((n[0], mean[0], sd[0]), (n[1], mean[1], sd[1]))
-                figures = {"first_n": n[0], "n": n[1], "first_mean": mean[0], "first_sd": sd[0], "mean": mean[1]}
-                figures |= {"sd": sd[1], "difference": mean[1] - mean[0], "ci95_low": low, "ci95_high": high}
-                figures["difference_std"] = float(np.hypot(*std))
-                rows.append({**about, "measure": measure, "unit": unit.replace("_", "/"), **figures})
+                values = {"first_n": n[0], "n": n[1], "first_mean": mean[0], "first_sd": sd[0], "mean": mean[1]}
+                values |= {"sd": sd[1], "difference": mean[1] - mean[0], "ci95_low": low, "ci95_high": high}
+                values["difference_std"] = float(np.hypot(*std))
+                rows.append({**about, "measure": measure, "unit": unit.replace("_", "/"), **values})
     return pl.DataFrame(rows)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
-from ..recording.gaps import find_runs
 from .euler import count_turns
 from .joints import JOINTS, MAX_NEAR_LOCK, Angles
 
@@ -34,10 +33,6 @@ MIN_CMC = 0.85
 _REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
 _CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
 _NO_SPANS = np.empty((0, 2))
-# A hand moves above this speed [m/s]; the trunk sways more slowly. Stops below this time [s] are part of a movement.
-MOVE_SPEED, REST_S = 0.08, 0.8
-MIN_MOVE_S = 0.5  # [s]; what is shorter is no movement
-LEAST_SHARE = 0.6  # of the median duration of the movements, the shorter of two against the longer
 MAX_GAP = 0.2  # of the samples of a main angle
 MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not determined for
 
@@ -134,28 +129,6 @@ def _are_alike(curves: np.ndarray) -> np.ndarray:
     usual -= usual.mean()
     size = np.linalg.norm(centred, axis=1) * np.linalg.norm(usual)
     return np.asarray(centred @ usual >= MIN_CORRELATION * np.maximum(size, 1e-12))
-
-
-def find_movements(time: np.ndarray, *points: np.ndarray) -> np.ndarray:
-    """Find the movements between rests, spans (r, 2) [s], of hands (n, 3) [m] that begin and end each one at rest.
-
-    Those whose duration differs much from the median one are other movements and left out. None where fewer than three
-    are left. `time` (n,) [s] is even.
-    """
-    rate_hz = (len(time) - 1) / (time[-1] - time[0])
-    moving = np.zeros(len(time), dtype=bool)
-    for point in points:
-        smoothed = np.column_stack([_smooth(time, axis) for axis in np.nan_to_num(point).T])
-        moving |= np.linalg.norm(np.gradient(smoothed, axis=0), axis=1) * rate_hz > MOVE_SPEED
-    rests = [(a, b) for a, b in find_runs(~moving) if b - a < REST_S * rate_hz and a > 0 and b < len(time)]
-    for a, b in rests:
-        moving[a:b] = True
-    spans = np.array([(time[a], time[b - 1]) for a, b in find_runs(moving)]).reshape(-1, 2)
-    movements = spans[spans[:, 1] - spans[:, 0] >= MIN_MOVE_S]
-    seconds = movements[:, 1] - movements[:, 0]
-    usual = np.median(seconds) if len(seconds) else 0.0
-    movements = movements[(seconds >= LEAST_SHARE * usual) & (seconds <= usual / LEAST_SHARE)]
-    return movements if len(movements) >= MIN_REPETITIONS else _NO_SPANS
 
 
 def _smooth(time: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -67,10 +67,10 @@ def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(No
 def compute_summary_std(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:
     """Compute the standard deviations of a joint's summaries, to first order; NaN where nothing is stated.
 
-    Those of a range and of a rate are of two samples. Their error is taken once as constant in W, as that of a heading
-    is, and once as constant in each segment, as that of a mount is; the larger standard deviation of the two counts.
-    `samples` (s, 3, 4) are those of `JointSummary` for each of s spans; of the same shape are the results: of the
-    lowest, the highest and the range [rad], and of the peak rate [rad/s].
+    A range and a rate are of two samples. Their error is taken once as constant in W, as that of a heading, and once as
+    constant in each segment, as that of a mount; the larger standard deviation of the two counts. `samples` (s, 3, 4)
+    are those of `JointSummary` for each of s spans; of the same shape are the results: of the lowest, the highest and
+    the range [rad], and of the peak rate [rad/s].
     """
     stds = np.full(samples.shape, np.nan)
     if joint.std is None:

@@ -62,8 +62,7 @@ def joint_torques(
     Parameters
     ----------
     model : with inertias in [kg], [kg m²], z up; a `BodyModel` has one in `pin`
-    time : (n,) [s], uniform
-    q : (n, nq)
+    time, q : (n,) [s], uniform; (n, nq)
     cutoff_hz : of the smoothing; below half of the sampling rate
     joints : those that are asked for, by Pinocchio's number; None: all that bear a mass
 

@@ -92,17 +92,17 @@ def _run_steps(item: Item, session: Path, subject: Path | None, folder: Path) ->
     for step, options in item.steps.items():
         out, inputs = folder / step, [places[name] for name in STEPS[step]]
         if step == "calibrate":
-            calibration = _run_command(step, inputs, {**options, **item.person, "out": out}).calibration
+            calibration = _run_command(step, inputs, {**options, **item.person, "out": out}).result
             row |= {"quality": calibration.quality.quality, "gap_mm": 1e3 * calibration.rms_gap}
             for name, value in calibration.subject.lengths.items():
                 row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": 1e3 * calibration.subject.std(name)}
             subject = out
         elif step == "track":
-            tracked = _run_command(step, inputs, {**options, "out": out} | ({"subject": subject} if subject else {}))
-            row |= {name: tracked.summary[name] for name in ("samples", "rate_hz", "duration_s")}
-            row["diagnostics"] = len(tracked.summary["diagnostics"]) + len(tracked.page_failures)
+            summary = _run_command(step, inputs, {**options, "out": out} | ({"subject": subject} if subject else {}))
+            row |= {name: summary[name] for name in ("samples", "rate_hz", "duration_s")}
+            row["diagnostics"] = len(summary["diagnostics"])
         elif step == "retarget":
-            summary = _run_command(step, inputs, {**options, "out": out}).summary
+            summary = _run_command(step, inputs, {**options, "out": out}).result
             row["trajectory_within_limits"] = summary["within_limits"]
             row["trajectory_self_collisions"] = summary["self_collisions"]["samples"]
         elif step == "export":

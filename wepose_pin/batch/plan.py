@@ -5,15 +5,15 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-from ..body import load_table
+from ..body import list_breadths, load_table
 from ..commands.command_line import APP, parse
 from ..data_tables import read_table
-from ..documents import Key, TomlTable, read_record, read_toml
+from ..documents import TomlTable, read_toml
 from ..errors import BadPlan, WeposeError, one_of
 from .storage import find_urls, is_remote
 
@@ -28,16 +28,9 @@ STEPS = {
 _LONGEST_NAME = 100  # letters of an item's folder
 
 
-class Person(NamedTuple):
-    """The options of `calibrate` that belong to a person, of ``[subjects.NAME]`` or a row of a table."""
-
-    stature: Annotated[float | None, Key(least=1.0, most=2.5)] = None
-    sex: Literal["", "f", "m"] = ""
-    measured: Mapping[str, float] = {}
-
-
+PERSON = ("stature", "sex", "measured")  # options of `calibrate` that belong to a person
 # Follow from an item's session and subject, or are not of one session.
-_ITEM_OPTIONS = ("out", "subject", "format", "episodes", "instruction", "force", *Person._fields)
+_ITEM_OPTIONS = ("out", "subject", "format", "episodes", "instruction", "force", *PERSON)
 
 
 class Subject(NamedTuple):
@@ -88,34 +81,27 @@ def read_plan(path: Path, items_folder: str) -> Plan:
     top.allow("sessions", "subjects", "steps")
     steps = _read_steps(top.table("steps"), path)
     tables = top.table("subjects", {})
-    subjects = {name: _read_subject(tables.table(name), path) for name in tables.values}
-    without_calibration = {step: options for step, options in steps.items() if step != "calibrate"}
+    subjects = {name: _read_subject(tables.table(name), path, steps) for name in tables.values}
     calibrations: dict[str, Item] = {}
     items: dict[str, Item] = {}
     for keys in _list_sessions(top.table("sessions"), path):
-        person, session = _read_person(keys, "session", "name", "subject"), keys.values["session"]
-        subject_name, subject = keys.text("subject", None), Subject({})
-        if subject_name and (subjects or "calibrate" not in steps):
-            if subject_name not in subjects:
-                raise BadPlan(
-                    f"{keys.where}: subject '{subject_name}' is not in the plan; {one_of(subjects, subject_name)}"
-                )
-            subject = subjects[subject_name]
-            person = person or dict(subject.person)
-        file = subject.file
+        session, name = keys.values["session"], keys.text("subject", None)
+        if name and name not in subjects and (subjects or "calibrate" not in steps):
+            raise BadPlan(f"{keys.where}: subject '{name}' is not in the plan; {one_of(subjects, name)}")
+        subject = subjects.get(name or "", Subject({}))
+        person, file = _read_person(keys, "session", "name", "subject") or subject.person, subject.file
         if subject.calibration:
-            if "calibrate" not in steps:
-                raise BadPlan(f"{tables.at(str(subject_name))}.calibration: needs the step [steps.calibrate]")
-            name, only = f"subject-{_sanitize(str(subject_name))}", {"calibrate": steps["calibrate"]}
-            calibrations[name] = Item(name, subject.calibration, only, subject_name, person=person)
-            file = f"{items_folder}/{name}/calibrate/subject.toml"
-        own = without_calibration if file else steps
+            folder = f"subject-{_sanitize(name or '')}"
+            only = {"calibrate": steps["calibrate"]}
+            calibrations[folder] = Item(folder, subject.calibration, only, name, person=person)
+            file = f"{items_folder}/{folder}/calibrate/subject.toml"
+        own = {step: options for step, options in steps.items() if not (file and step == "calibrate")}
         if not own:
             raise BadPlan(f"{keys.where}: nothing to do: its subject is calibrated elsewhere; it needs another step")
-        name = _sanitize(keys.text("name", None) or "") or _derive_name(session, path)
-        if name in items or name in calibrations:
-            raise BadPlan(f"{keys.where}: '{name}' names two items; the column 'name' of a table can name them")
-        items[name] = Item(name, session, own, subject_name, file or None, person)
+        folder = _sanitize(keys.text("name", None) or "") or _derive_name(session, path)
+        if folder in items or folder in calibrations:
+            raise BadPlan(f"{keys.where}: '{folder}' names two items; the column 'name' of a table can name them")
+        items[folder] = Item(folder, session, own, name, file or None, person)
     return Plan(tuple(calibrations.values()), tuple(items.values()))
 
 
@@ -139,7 +125,6 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
     """Step → the options that are given, in the order in which the steps run; each is checked before any work."""
     from ..writers.export import ROBOTS, list_formats
 
-    formats = [name for name, format in list_formats().items() if format.of != ROBOTS]
     table.allow(*STEPS)
     steps: dict[str, dict[str, Any]] = {}
     for step in [step for step in STEPS if step in table]:
@@ -155,38 +140,48 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
         if step not in ("calibrate", "track") and "track" not in steps:
             raise BadPlan(f"{keys.where}: needs the step [steps.track], which is missing")
         if step == "export":
-            options["formats"] = list(keys.texts("formats") or ("",))
-            for each in options["formats"]:
+            options["formats"] = list(keys.texts("formats"))
+            formats = [name for name, format in list_formats().items() if format.of != ROBOTS]
+            for each in options["formats"] or [""]:
                 if each not in formats:
-                    raise BadPlan(
-                        f"{keys.at('formats')}: '{each}' is no format of a person's motion; {one_of(formats, each)}"
-                    )
-        of_command = {name: value for name, value in options.items() if (step, name) != ("export", "formats")}
-        try:
-            parse(write_words(step, STEPS[step], of_command | ({} if step == "evaluate" else {"out": "OUT"})))
-        except WeposeError as error:
-            raise BadPlan(f"{keys.where}: {error}") from None
+                    place = keys.at("formats")
+                    raise BadPlan(f"{place}: '{each}' is no format of a person's motion; {one_of(formats, each)}")
+        _check_options(keys, step, {name: value for name, value in options.items() if name != "formats"})
     if not steps:
         raise BadPlan(f"{table.where}: no step; {one_of(STEPS)}")
     return steps
 
 
-def _read_subject(keys: TomlTable, path: Path) -> Subject:
+def _check_options(keys: TomlTable, step: str, options: Mapping[str, Any]) -> None:
+    """Raise `BadPlan` where the command of a step refuses its options."""
+    try:
+        parse(write_words(step, STEPS[step], {**options, **({} if step == "evaluate" else {"out": "OUT"})}))
+    except WeposeError as error:
+        raise BadPlan(f"{keys.where}: {error}") from None
+
+
+def _read_subject(keys: TomlTable, path: Path, steps: Collection[str]) -> Subject:
     person = _read_person(keys, "file", "calibration")
     file, calibration = (_resolve(keys.text(name, None) or "", path) for name in ("file", "calibration"))
     if calibration and file:
         raise BadPlan(f"{keys.at('file')}: a subject has a file or a calibration, not both")
-    for place in (calibration, file):
-        if place and not is_remote(place) and not Path(place).exists():
-            raise BadPlan(f"{keys.where}: {place}: no such file; a path from the plan's folder, or a URL, is needed")
+    if calibration and "calibrate" not in steps:
+        raise BadPlan(f"{keys.at('calibration')}: needs the step [steps.calibrate]")
+    place = calibration or file
+    if place and not is_remote(place) and not Path(place).exists():
+        raise BadPlan(f"{keys.where}: {place}: no such file; a path from the plan's folder, or a URL, is needed")
     return Subject(person, file, calibration)
 
 
 def _read_person(keys: TomlTable, *others: str) -> dict[str, Any]:
     """The options of `calibrate` that are given of a person, in a table with these other keys."""
-    keys.table("measured", {}).allow(*load_table().lengths)
-    person = read_record(Person, keys, others=others)
-    return {name: value for name, value in person._asdict().items() if value}
+    keys.allow(*PERSON, *others)
+    body = load_table()
+    keys.table("measured", {}).allow(*body.lengths, *list_breadths(body))
+    person = {name: keys.values[name] for name in PERSON if keys.values.get(name)}
+    if person:
+        _check_options(keys, "calibrate", person)
+    return person
 
 
 def _list_sessions(keys: TomlTable, path: Path) -> Iterator[TomlTable]:

@@ -45,7 +45,7 @@ def angles(
         Further results, each compared with the first one.
     out
         Write tables as .csv (all angles over time; lowest, highest, range and peak rate in each repetition and phase;
-        means; curves; definitions), the figures as .svg, and angles.html, which shows all of it, to this folder.
+        means; curves), the figures as .svg, and angles.html, which shows all of it, to this folder.
     low_pass_hz
         Low-pass the orientations at this frequency (half the amplitude there). Without it they are not filtered.
     repetitions
@@ -93,16 +93,7 @@ def angles(
                     source, rising = movement.repetitions.source, movement.repetitions.rising
                     chosen = replace(chosen, main_angle=source, rising=rising)
             progress("writing", 0.7)
-            tables = {
-                "angles": build.build_angle_table(movements),
-                "sessions": build.build_session_table(movements),
-                "repetitions": build.build_repetition_table(movements),
-                "phases": build.build_phase_table(movements),
-                "summary": build.build_summary_table(movements),
-                "curves": build.build_curve_table(movements),
-                "comparison": build.build_comparison_table(movements),
-                "definitions": build.build_definition_table(movements),
-            }
+            tables = build.build_tables(movements)
             for name, table in tables.items():
                 if len(table):
                     rounded = table.with_columns(selectors.float().round(DECIMALS))
@@ -118,7 +109,7 @@ def angles(
     print_diagnostics([*lock.values(), *failures])
     print_table(*report.tabulate_sessions(tables["sessions"]))
     for text in report.explain_missing(movements):
-        say(f"{text} {report.ADVICE}")
+        say(text)
     if len(tables["summary"]):
         print_table(*report.tabulate_means(tables["summary"]))
     filtered = "not low-passed" if low_pass_hz is None else f"low-passed at {low_pass_hz:g} Hz (half amplitude)"

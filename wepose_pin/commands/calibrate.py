@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from ..diagnostics import Diagnostic, lines
 from ..errors import WrongOption
@@ -21,23 +21,9 @@ from .options import (
     Stature,
     Subject,
 )
-from .output import print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
-
-if TYPE_CHECKING:
-    from ..calibration import Calibration
+from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
-
-
-class Calibrated(NamedTuple):
-    """What came of `calibrate`."""
-
-    calibration: Calibration
-    page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
-
-    @property
-    def exit_code(self) -> int:
-        return EXIT_CODES[self.calibration.quality.quality]
 
 
 def calibrate(
@@ -56,7 +42,7 @@ def calibrate(
     force: Force = False,
     method: Annotated[MethodOption, RESEARCH] = "amekf",
     formulation: Annotated[Formulation, RESEARCH] = "full",
-) -> Calibrated:
+) -> Outcome:  # of a Calibration
     """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
 
     Joined hands determine the proportions of the arms and not their scale. Measure one length, such as the breadth of
@@ -147,4 +133,4 @@ def calibrate(
     say(f"Quality: {quality.quality}")
     for _, line in lines(quality.reasons):
         say_paragraph(line, "  ")
-    return Calibrated(calibration, failures)
+    return Outcome(calibration, EXIT_CODES[quality.quality])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -110,54 +109,40 @@ def _print_errors(errors: Evaluation) -> None:
     say(f"{errors.samples} samples from {format_span(errors.interval)}")
     if errors.registration is not None:
         _say_registration(errors.registration)
-    attitude = [
-        (
-            name,
-            *(f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw)),
-            *(f"{rmse:.2f}" for rmse in (error.inclination_rmse, error.heading_rmse, error.total_rmse)),
-            f"{error.drift_deg_min:+.2f}",
-        )
-        for name, error in errors.attitude.items()
-    ]
-    joints = [
-        (
-            *(joint, angle, f"{e.mean:+.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}"),
-            *(f"{e.lower:+.2f} to {e.upper:+.2f}", f"{e.icc:.3f}", f"{e.range:.0f}"),
-        )
-        for joint, angles in errors.joints.items()
-        for angle, e in angles.items()
-    ]
-    places = errors.position, errors.position_on_limb
-    positions = [
-        (name, *(f"{each[name].mean:.1f} ± {each[name].std:.1f}" if name in each else "" for each in places))
-        for name in errors.position
-    ]
-    points = {f"{name} (point)": stated for name, stated in errors.position_uncertainty.items()}
-    uncertainty = [
-        (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
-        for name, u in {**errors.attitude_uncertainty, **points}.items()
-    ]
-    tables: tuple[tuple[str, tuple[str, ...], Sequence[Sequence[str]]], ...] = (
-        (
-            "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
-            ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
-            attitude,
-        ),
-        (
-            "Joint angle error [deg], near gimbal lock left out; limits of agreement (Bland-Altman, 95 %); ICC(A,1)",
-            ("joint", "angle", "mean", "rms", "largest", "limits of agreement", "ICC", "range"),
-            joints,
-        ),
-        ("Position error [mm], mean ± std", ("point", "from the root", "from where its limb begins"), positions),
-        (
-            "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
-            ("of", "normalised", "within 1 std", "within 2 std"),
-            uncertainty,
-        ),
+    rows: list[tuple[str, ...]] = []
+    for name, error in errors.attitude.items():
+        axes = (f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw))
+        rms = (f"{value:.2f}" for value in (error.inclination_rmse, error.heading_rmse, error.total_rmse))
+        rows.append((name, *axes, *rms, f"{error.drift_deg_min:+.2f}"))
+    print_table(
+        "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
+        ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
+        rows,
     )
-    for title, header, rows in tables:
-        if rows:
-            print_table(title, header, rows)
+    rows = []
+    for joint, angles in errors.joints.items():
+        for angle, e in angles.items():
+            limits, icc, extent = f"{e.lower:+.2f} to {e.upper:+.2f}", f"{e.icc:.3f}", f"{e.range:.0f}"
+            rows.append((joint, angle, f"{e.mean:+.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}", limits, icc, extent))
+    print_table(
+        "Joint angle error [deg], near gimbal lock left out; limits of agreement (Bland-Altman, 95 %); ICC(A,1)",
+        ("joint", "angle", "mean", "rms", "largest", "limits of agreement", "ICC", "range"),
+        rows,
+    )
+    rows = []
+    for name in errors.position:
+        known = [each.get(name) for each in (errors.position, errors.position_on_limb)]
+        rows.append((name, *("" if each is None else f"{each.mean:.1f} ± {each.std:.1f}" for each in known)))
+    print_table("Position error [mm], mean ± std", ("point", "from the root", "from where its limb begins"), rows)
+    points = {f"{name} (point)": stated for name, stated in errors.position_uncertainty.items()}
+    print_table(
+        "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
+        ("of", "normalised", "within 1 std", "within 2 std"),
+        [
+            (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
+            for name, u in {**errors.attitude_uncertainty, **points}.items()
+        ],
+    )
 
 
 def _say_registration(registration: Registration) -> None:
@@ -169,8 +154,7 @@ def _say_registration(registration: Registration) -> None:
     say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
     say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
     say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
-    if any(registration.shift_m):
-        say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
+    say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
     if registration.frames_deg:
         listed = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
         say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {listed}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -27,22 +27,6 @@ def _read_whole_number(_kind: type, tokens: Sequence[Token]) -> int:
     return int(tokens[0].value)
 
 
-# Validators: rooms load when an option is given ----------------------------------------------------------------------
-
-
-def _check_interval(_kind: type, interval: tuple[float, float] | None) -> None:
-    from ..recording import check_selection
-
-    check_selection(interval, None)
-
-
-def _check_model(_kind: type, model: str | None) -> None:
-    path = Path(model or "")
-    if model is not None and not path.is_file() and (path.suffix or len(path.parts) > 1):
-        needed = "no such file; a URDF, a TOML that names one, or the name of a body of the package is needed"
-        raise WrongOption("model", model, needed)
-
-
 def _checked_by(place: str) -> Parameter:
     """The check is a function ``MODULE:NAME`` of this package, imported when the option is given."""
 
@@ -54,6 +38,30 @@ def _checked_by(place: str) -> Parameter:
     return Parameter(validator=check)
 
 
+def _check_model(_kind: type, model: str | None) -> None:
+    path = Path(model or "")
+    if model is not None and not path.is_file() and (path.suffix or len(path.parts) > 1):
+        needed = "no such file; a URDF, a TOML that names one, or the name of a body of the package is needed"
+        raise WrongOption("model", model, needed)
+
+
+def _read_entries(numbers: bool, words: Sequence[Token]) -> dict[str, Any]:
+    """What several ``NAME=VALUE`` say: numbers alone, or else a text where it is no number."""
+    needed, entries = "NAME=METRES" if numbers else "NAME=VALUE", dict[str, Any]()
+    for word in words:
+        name, equals, value = word.value.partition("=")
+        if not (name and equals):
+            raise BadOption(f"{word.keyword}: '{word.value}': {needed} is needed")
+        if name in entries:
+            raise BadOption(f"{word.keyword} {word.value}: '{name}' is given twice")
+        entries[name] = value
+        with contextlib.suppress(ValueError):
+            entries[name] = float(value)
+        if entries[name] != entries[name] or (numbers and entries[name] == value):
+            raise BadOption(f"{word.keyword}: {word.value}: '{value}' is not a number; {needed} is needed")
+    return entries
+
+
 # Options of several commands, with their help ------------------------------------------------------------------------
 
 Force = Annotated[bool, Parameter(help="Replace the files of an earlier run.")]
@@ -62,7 +70,8 @@ _GAPS = "Accept gaps of more than 50 ms: bridge them, and mark them in pose.parq
 Gaps = Annotated[bool, Parameter(help=_GAPS)]
 Interval = Annotated[
     tuple[float, float],
-    Parameter(metavar="FROM TO", help="Use only this time of the recording, in seconds.", validator=_check_interval),
+    Parameter(metavar="FROM TO", help="Use only this time of the recording, in seconds."),
+    _checked_by("recording:check_selection"),
 ]
 Phase = Annotated[
     str,
@@ -82,25 +91,6 @@ LiveMethodOption = Annotated[LiveMethod, Parameter(help=_FILTERS.format(""))]
 
 
 # Values --------------------------------------------------------------------------------------------------------------
-
-
-def _read_entries(_kind: type, words: Sequence[Token], needed: str = "NAME=METRES") -> dict[str, Any]:
-    """What several ``NAME=VALUE`` say; as NAME=METRES only numbers, else a number where it is one."""
-    entries: dict[str, Any] = {}
-    for word in words:
-        name, equals, value = word.value.partition("=")
-        if not (name and equals):
-            raise BadOption(f"{word.keyword}: '{word.value}': {needed} is needed")
-        if name in entries:
-            raise BadOption(f"{word.keyword} {word.value}: '{name}' is given twice")
-        try:
-            entries[name] = float(value)
-        except ValueError:
-            entries[name] = value
-        if entries[name] != entries[name] or (isinstance(entries[name], str) and needed == "NAME=METRES"):
-            raise BadOption(f"{word.keyword}: {word.value}: '{value}' is not a number; {needed} is needed")
-    return entries
-
 
 Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
 OutFile = Annotated[Path, Parameter(alias="-o", metavar="FILE")]
@@ -131,7 +121,9 @@ if TYPE_CHECKING:
     Measured = Mapping[str, float]
     Imperfection = Mapping[str, float | str]
 else:  # cyclopts collects the values of an option that is given several times only of a list
-    Measured = Annotated[list[str], Parameter(metavar="NAME=METRES", converter=_read_entries)]
+    Measured = Annotated[
+        list[str], Parameter(metavar="NAME=METRES", converter=lambda _, words: _read_entries(True, words))
+    ]
     Imperfection = Annotated[
-        list[str], Parameter(metavar="NAME=VALUE", converter=partial(_read_entries, needed="NAME=VALUE"))
+        list[str], Parameter(metavar="NAME=VALUE", converter=lambda _, words: _read_entries(False, words))
     ]

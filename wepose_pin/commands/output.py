@@ -7,6 +7,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from ..diagnostics import Diagnostic, lines
 from ..errors import printable
@@ -14,6 +15,13 @@ from .stopping import check_stopped
 
 WIDTH = 98  # columns of running text
 TABLE_WIDTH = 160  # rich would cut numbers off to fit a narrow terminal, which wraps by itself
+
+
+class Outcome(NamedTuple):
+    """What came of a command whose exit code says how good it is."""
+
+    result: Any
+    exit_code: int
 
 
 def say(text: str) -> None:
@@ -40,14 +48,19 @@ def say_pages(folder: Path, pages: Mapping[str, str]) -> None:
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A table, as reports have it; the first column is text, the others numbers. Without a header: names and values."""
+    """A table, as reports have it, unless it is empty; the first column is text, the others numbers.
+
+    Without a header: names and values.
+    """
     from rich import box
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD, show_header=bool(header))
     rows = list(rows)
+    if not rows:
+        return
+    table = Table(box=box.SIMPLE_HEAD, show_header=bool(header))
     for k, name in enumerate(header or ("", "")):
         table.add_column(escape(name), justify="right" if k and header else "left", no_wrap=bool(header))
     for row in rows:
@@ -55,8 +68,7 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
     console = Console(width=TABLE_WIDTH)
     if title:
         console.print(escape(_shown(title)), style="bold", highlight=False)
-    if rows:
-        console.print(table)
+    console.print(table)
 
 
 @contextlib.contextmanager

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from ..diagnostics import Diagnostic, from_json
+from ..diagnostics import from_json
 from .options import MORE, Arms, Factor, Force, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
-from .output import print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
+from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 if TYPE_CHECKING:
     from ..body.kinematics import Pose
     from ..retargeting import Trajectory
-
-
-class Retargeted(NamedTuple):
-    """What came of `retarget`."""
-
-    summary: Mapping[str, Any]  # as in summary.json, page failures apart
-    page_failures: list[Diagnostic]
-    duration_s: float
-
-    @property
-    def exit_code(self) -> int:
-        """0 where a robot may run it: limits kept, no self-collision."""
-        return 3 if not self.summary["within_limits"] or self.summary["self_collisions"]["samples"] else 0
 
 
 def retarget(
@@ -47,7 +33,7 @@ def retarget(
     smoothing_hz: Annotated[Hz, MORE] = 6.0,
     speed_scale: Annotated[Share, MORE] = 0.9,
     limit_margin: Annotated[Radians, MORE] = 0.05,
-) -> Retargeted:
+) -> Outcome:  # of what summary.json holds
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
     Robots by name: panda, panda_table, ur5, ur5_table, so101, baxter, tiago_dual, talos, g1, alex. Any other by its
@@ -138,33 +124,26 @@ def retarget(
             return report_room.render_retargeting_report(trajectory, summary, title=title, view=page)
 
         pages = ({"view.html": make_view} if view else {}) | ({"report.html": make_report} if report else {})
-        failures = write_pages(out, pages, "summary.json")
+        failures = write_pages(out, pages)
     print_diagnostics([*map(from_json, summary["diagnostics"]), *failures])
     for table in (report_room.tabulate_run(summary), *report_room.tabulate_hands(summary)):
         print_table(*table)
     say_paragraph(report_room.describe_reliance(trajectory, summary))
-    say_paragraph(report_room.describe_limits(summary))
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     say_pages(out, ({"Report": "report.html"} if report else {}) | ({"Motion": "view.html"} if view else {}))
-    return Retargeted(summary, failures, float(trajectory.time[-1]))
+    runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]
+    return Outcome(summary, 0 if runnable else 3)
 
 
 def _find_repetitions(pose: Pose, trajectory: Trajectory) -> dict[str, Any]:
-    """The repetitions of the arms that a robot follows, by which angle, when [s].
-
-    They are those that `wepose angles` finds; where no angle repeats, the movements of the hands between rests.
-    """
+    """The repetitions of the arms that a robot follows, as `wepose angles` finds them: by which angle, when [s]."""
     from dataclasses import replace
 
     from ..angles import joint_angles
-    from ..angles.repetitions import find_movements, find_repetitions
+    from ..angles.repetitions import find_repetitions
 
-    angles, targets = joint_angles(pose), trajectory.arm_targets
+    angles = joint_angles(pose)
     sides = tuple(arm.side for arm in trajectory.robot.arms)
     of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
     repetitions = find_repetitions(replace(angles, joints=of_arms))
-    source, spans, reason = repetitions.source, repetitions.spans, repetitions.reason
-    if not len(spans):
-        spans = find_movements(targets.time, *(hand.position for hand in targets.hands))
-        source, reason = ("hands between rests", "") if len(spans) else (source, reason)
-    return {"source": source, "spans": spans.tolist(), "reason": reason}
+    return {"source": repetitions.source, "spans": repetitions.spans.tolist(), "reason": repetitions.reason}

@@ -12,10 +12,9 @@ from .output import progress_bar, say
 if TYPE_CHECKING:
     from ..simulation import Imperfections
 
-ACTIVITY_S = 40.0
 PROTOCOL, SHORT_PROTOCOL = "clasp+t_pose", "clasp"
 LEAST_S = 30.0  # from which on there is time for the T-pose
-PROTOCOL_S = 60.0  # of what is done between start pose and circles
+PROTOCOL_S, ACTIVITY_S = 60.0, 40.0
 LONGEST_S = 7200.0
 CIRCLES = 6  # drawn by the right hand after the protocol
 
@@ -75,7 +74,7 @@ def simulate(
     import numpy as np
 
     from .. import simulation as room
-    from ..body import DEFAULT_BODY
+    from ..body import DEFAULT_BODY, list_breadths, load_table
     from ..body.subject import mount_rows, subject_toml
     from ..documents import whole_folder
     from ..simulation.motion import find_task
@@ -91,17 +90,16 @@ def simulate(
     if seconds is not None and not 5.0 <= seconds <= LONGEST_S:
         raise BadOption(f"--seconds {seconds:g}: between 5 and {LONGEST_S:g}")
     sizes = choose_imperfections(preset, imperfection or {})
-    is_people = preset == "people"
+    measured_std = room.PEOPLE_MEASURED_STD if preset == "people" else room.MEASURED_STD
+    motion: dict[str, Any] = {"seed": seed, "rate_hz": rate_hz, "imperfections": sizes}
     with progress_bar() as progress, whole_folder(out, force) as folder:
         progress("simulating a person", 0.0)
-        body = room.ACTIVITIES[activity].body if activity else DEFAULT_BODY
-        person = room.simulate_person(seed, room.PEOPLE_MEASURED_STD if is_people else room.MEASURED_STD, body)
-        motion: dict[str, Any] = {"seed": seed, "rate_hz": rate_hz, "imperfections": sizes}
+        person = room.simulate_person(seed, measured_std, room.ACTIVITIES[activity].body if activity else DEFAULT_BODY)
         if activity:
-            seconds = ACTIVITY_S if seconds is None else seconds
+            seconds = seconds or ACTIVITY_S
             simulation = room.simulate_activity(activity, seconds=seconds, lengths=person.lengths, **motion)
         else:
-            seconds = PROTOCOL_S if seconds is None else seconds
+            seconds = seconds or PROTOCOL_S
             protocol = protocol or (PROTOCOL if seconds >= LEAST_S else SHORT_PROTOCOL)
             simulation = room.simulate(person.lengths, clasp_s=seconds, protocol=protocol, circles=CIRCLES, **motion)
         write_session(folder, simulation.recording(f"simulated-{seed}"), simulation.truth())
@@ -118,9 +116,12 @@ def simulate(
         )
         (folder / "subject.toml").write_text(subject_toml(true), encoding="utf-8")
         write_provenance(folder, collect_provenance("simulate", options))
-    tape = _tape_breadths(person.measured) if is_people else person.measured
-    measured = " ".join(f"{name}={value:.4f}" for name, value in tape.items())
-    about = f"measured: {measured}, stature {person.stature:.2f} m, sex {person.sex}"
+    measured = person.measured
+    if preset == "people":  # a tape reaches a person's breadths over the bones, not the joint centres
+        breadths = list_breadths(load_table())
+        measured = {name: measured[length] / ratio for name, (length, ratio, _) in breadths.items()}
+    lengths = " ".join(f"{name}={value:.4f}" for name, value in measured.items())
+    about = f"measured: {lengths}, stature {person.stature:.2f} m, sex {person.sex}"
     say(f"Session: {out / 'session.toml'}  ({about})")
     say(f"Truth: {out / 'truth.parquet'}  {out / 'subject.toml'}")
 
@@ -148,11 +149,3 @@ def choose_imperfections(preset: str, changes: Mapping[str, float | str]) -> Imp
         except BadOption as error:
             raise BadOption(f"--imperfection {name}={value}: {error}") from None
     return sizes
-
-
-def _tape_breadths(measured: Mapping[str, float]) -> dict[str, float]:
-    """The breadths [m] that a tape reaches on a person, of measured lengths that no tape does."""
-    from ..body import list_breadths, load_table
-
-    breadths = list_breadths(load_table())
-    return {name: measured[length] / ratio for name, (length, ratio, _) in breadths.items()}

@@ -5,18 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from ..diagnostics import Diagnostic, from_json
 from .options import MORE, RESEARCH, AcceptFailed, Force, Gaps, MethodOption, Model, Out, Subject
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
-
-
-class Tracked(NamedTuple):
-    """What came of `track`."""
-
-    summary: Mapping[str, Any]  # as in summary.json, page failures apart
-    page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
 
 
 def track(
@@ -37,7 +30,7 @@ def track(
     causal: Annotated[bool, RESEARCH] = False,
     open_loop: Annotated[bool, RESEARCH] = False,
     limits: Annotated[bool, RESEARCH] = True,
-) -> Tracked:
+) -> Mapping[str, Any]:  # as in summary.json
     """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
 
     `wepose angles` and `wepose export` compute the joint angles of a person from the result.
@@ -133,7 +126,10 @@ def track(
             progress("making the pages", 2 / 3)
             failures = write_track_pages(out, summary, view=view, report=report, fps=view_rate_hz or 30.0)
     content = summary.content
-    _print_summary(content)
+    print_diagnostics(from_json(each) for each in content["diagnostics"])
+    _print_sensors(content)
+    if "joints" in content:
+        _print_joints(content)
     print_diagnostics(failures)
     motion = "Motion" + (f", {view_rate_hz:.2g} frames a second" if view_rate_hz else "")
     say_pages(out, ({"Report": "report.html"} if report else {}) | ({motion: "view.html"} if view else {}))
@@ -142,12 +138,11 @@ def track(
         say(f"Joints: {out / 'joints.parquet'}")
     if torques:
         say(f"Torques, estimates: {out / 'torques.parquet'}")
-    return Tracked(content, failures)
+    return content
 
 
-def _print_summary(summary: Mapping[str, Any]) -> None:
-    """Print diagnostics, the sensors' static share, bias and gravity, and the joints of a mechanism."""
-    print_diagnostics(from_json(each) for each in summary["diagnostics"])
+def _print_sensors(summary: Mapping[str, Any]) -> None:
+    """Print the sensors' static share, bias and gravity."""
     rows: list[tuple[str, ...]] = []
     for segment, about in summary["sensors"].items():
         if "static_share" not in about:
@@ -162,13 +157,12 @@ def _print_summary(summary: Mapping[str, Any]) -> None:
         ("sensor", "static", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
         rows,
     )
-    if "joints" in summary:
-        unknown = summary["undetermined_joints"]
-        print_table(
-            "Joints [rad or m]",
-            ("joint", "minimum", "maximum", ""),
-            [
-                (name, f"{values['min']:.3f}", f"{values['max']:.3f}", "undetermined" if name in unknown else "")
-                for name, values in summary["joints"].items()
-            ],
-        )
+
+
+def _print_joints(summary: Mapping[str, Any]) -> None:
+    """Print the range of each joint of a mechanism."""
+    rows = []
+    for name, values in summary["joints"].items():
+        unknown = "undetermined" if name in summary["undetermined_joints"] else ""
+        rows.append((name, f"{values['min']:.3f}", f"{values['max']:.3f}", unknown))
+    print_table("Joints [rad or m]", ("joint", "minimum", "maximum", ""), rows)

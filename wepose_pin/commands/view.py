@@ -41,18 +41,18 @@ def view(
     from ..writers.result import read_phases
 
     if out is None and (interval is not None or phase is not None):
-        option = f"phase {phase}" if interval is None else "interval {:g} {:g}".format(*interval)
+        option = "phase" if interval is None else "interval"
         raise BadOption(f"--{option}: needs -o FILE; view.html in the result shows the whole recording")
     page = out or result / "view.html"
     if not (result / "pose.parquet").is_file():
-        raise MissingFile(f"{result}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
-    check_file(page, force=force or out is None)
-    with progress_bar() as progress:
-        if out is not None or force or not page.is_file():
+        raise MissingFile(f"{result}: no pose.parquet in it; a folder that `wepose track` wrote is needed")
+    if out is not None or force or not page.is_file():
+        check_file(page, force)
+        with progress_bar() as progress:
             progress("making the page", 0.0)
             pose, model, summary = read_result(result, interval, phase)
             text = pose_html(model, pose, phases=read_phases(summary), title=summary.get("recording", result.name))
-            with whole_file(page, force=True) as partial:
+            with whole_file(page, force) as partial:
                 partial.write_text(text, encoding="utf-8")
     say(f"Motion:  {page}")
     if open and not webbrowser.open(page.absolute().as_uri()):

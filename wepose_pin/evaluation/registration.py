@@ -65,8 +65,7 @@ def register(
     pose = replace(pose, quat_WL={segment: pose.quat_WL[segment] for segment in segments})
     common = replace(truth, quat_WL={segment: truth.quat_WL[segment] for segment in segments})
     begin, end = float(pose.time[0]), float(pose.time[-1])
-    fit_end = begin + FITTED * (end - begin)
-    correlation = float("nan")
+    fit_end, correlation = begin + FITTED * (end - begin), float("nan")
     needed = f"a third of them aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
     if fit_end - begin < SHORTEST_S:
         raise BadData(f"the pose lasts {end - begin:.1f} s; {needed}")

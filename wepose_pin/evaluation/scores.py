@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import NamedTuple
 
@@ -159,37 +159,34 @@ def evaluate(
             f"({format_span((truth.time[0], truth.time[-1]))}) have no time in common"
             + (f" within the interval {format_span(interval)}" if interval else "")
         )
-    time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
+    pose = pose.cut(inside)
+    truth = _resample(truth, np.clip(pose.time, truth.time[0], truth.time[-1]))
     attitude, attitude_uncertainty = {}, {}
-    true_WL: dict[str, np.ndarray] = {}  # on the pose's times, NaN where one of the two is missing
-    for segment in [s for s in pose.quat_WL if s in truth.quat_WL]:
-        estimated = pose.quat_WL[segment][inside]
-        true = sample_orientations(truth.time, truth.quat_WL[segment], time)
-        known = np.isfinite(estimated).all(axis=1) & np.isfinite(true).all(axis=1)
+    for segment in [segment for segment in pose.quat_WL if segment in truth.quat_WL]:
+        quats = pose.quat_WL[segment], truth.quat_WL[segment]
+        known = np.isfinite(quats).all(axis=(0, 2))
         if known.any():
-            R_estimated, R_true = Rotation.from_quat(estimated[known]), Rotation.from_quat(true[known])
-            attitude[segment] = attitude_error(R_estimated, R_true, time[known])
-            true_WL[segment] = np.where(known[:, None], true, np.nan)
+            R_estimated, R_true = (Rotation.from_quat(quat[known]) for quat in quats)
+            attitude[segment] = attitude_error(R_estimated, R_true, truth.time[known])
             if segment in pose.segment_cov:
                 turn = (R_true * R_estimated.inv()).as_rotvec()
-                attitude_uncertainty[segment] = uncertainty(turn, pose.segment_cov[segment][inside][known])
+                attitude_uncertainty[segment] = uncertainty(turn, pose.segment_cov[segment][known])
     table = table or load_table()
     position, position_on_limb, position_uncertainty = {}, {}, {}
-    for point in [p for p in pose.points if p in truth.points]:
-        difference = pose.points[point][inside] - sample_points(truth.time, truth.points[point], time)
+    for point in [point for point in pose.points if point in truth.points]:
+        difference = pose.points[point] - truth.points[point]
         known = np.isfinite(difference).all(axis=1)
         if not known.any():
             continue
         position[point] = position_error(difference[known])
         if point in pose.point_cov:
-            position_uncertainty[point] = uncertainty(difference[known], pose.point_cov[point][inside][known])
+            position_uncertainty[point] = uncertainty(difference[known], pose.point_cov[point][known])
         limb = table.find_limb(point)
         if limb is not None and all(set(limb.origin) <= set(each.points) for each in (pose, truth)):
-            middle, true = (np.mean([each.points[name] for name in limb.origin], axis=0) for each in (pose, truth))
-            on_limb = difference - (middle[inside] - sample_points(truth.time, true, time))
-            known = np.isfinite(on_limb).all(axis=1)
+            difference = difference - np.mean([pose.points[name] - truth.points[name] for name in limb.origin], axis=0)
+            known = np.isfinite(difference).all(axis=1)
             if known.any():
-                position_on_limb[point] = position_error(on_limb[known])
+                position_on_limb[point] = position_error(difference[known])
     for kind, common, errors in (
         ("orientation of a segment", pose.quat_WL.keys() & truth.quat_WL.keys(), attitude),
         ("position of a point", pose.points.keys() & truth.points.keys(), position),
@@ -200,22 +197,23 @@ def evaluate(
         raise BadData(
             "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
         )
-    joints = _joint_errors(pose, inside, true_WL)
+    joints = _joint_errors(pose, truth, list(attitude))
     uncertainties = attitude_uncertainty, position_uncertainty
-    span = float(time[0]), float(time[-1])
-    return Evaluation(attitude, joints, position, position_on_limb, *uncertainties, span, int(inside.sum()))
+    span = float(truth.time[0]), float(truth.time[-1])
+    return Evaluation(attitude, joints, position, position_on_limb, *uncertainties, span, len(pose.time))
 
 
-def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]) -> dict[str, dict[str, AngleError]]:
-    """Joint → angle → its error over the samples `inside`.
+def _resample(truth: Pose, time: np.ndarray) -> Pose:
+    """The reference at other times (n,) [s], without covariances; NaN where it is not known."""
+    quat_WL = {name: sample_orientations(truth.time, quat, time) for name, quat in truth.quat_WL.items()}
+    return Pose(time, quat_WL, {name: sample_points(truth.time, p, time) for name, p in truth.points.items()})
 
-    `true_WL`: segment → (m, 4) xyzw on these samples
-    """
-    time = pose.time[inside]
-    gap = {segment: gap[inside] for segment, gap in pose.gap.items() if segment in true_WL}
-    estimated = Pose(time, {segment: pose.quat_WL[segment][inside] for segment in true_WL}, {}, gap=gap)
+
+def _joint_errors(pose: Pose, truth: Pose, segments: list[str]) -> dict[str, dict[str, AngleError]]:
+    """Joint → angle → its error, of joints between these segments."""
+    poses = [replace(each, quat_WL={name: each.quat_WL[name] for name in segments}) for each in (pose, truth)]
     try:
-        angles, true = joint_angles(estimated), joint_angles(Pose(time, true_WL, {}))
+        angles, true = map(joint_angles, poses)
     except BadData:  # no joint has both of its segments
         return {}
     errors = {}
@@ -238,20 +236,13 @@ def _rms(values: np.ndarray) -> float:
 def attitude_error(estimated: Rotation, true: Rotation, time: np.ndarray) -> AttitudeError:
     """Compute the attitude error of n orientations in W at `time` (n,) [s]."""
     error = estimated * true.inv()
-    angles = np.abs(error.as_euler("ZYX", degrees=True)).T
+    yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)).T
     heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
     inclination = np.degrees(np.arccos(np.clip(error.as_matrix()[:, 2, 2], -1.0, 1.0)))
     slope = np.polyfit(time - time[0], heading, 1)[0] if np.ptp(time) > 0.0 else 0.0
-    yaw, pitch, roll = ((float(angle.mean()), float(angle.std())) for angle in angles)
-    return AttitudeError(
-        roll=roll,
-        pitch=pitch,
-        yaw=yaw,
-        inclination_rmse=_rms(inclination),
-        heading_rmse=_rms(heading),
-        total_rmse=_rms(np.degrees(error.magnitude())),
-        drift_deg_min=60.0 * float(slope),
-    )
+    x, y, z = ((float(angle.mean()), float(angle.std())) for angle in (roll, pitch, yaw))
+    rms = _rms(inclination), _rms(heading), _rms(np.degrees(error.magnitude()))
+    return AttitudeError(x, y, z, *rms, 60.0 * float(slope))
 
 
 def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
@@ -262,12 +253,9 @@ def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
     error, cov = error[stated], cov[stated]
     if not len(error):
         return Uncertainty(np.nan, np.nan, np.nan)
-    normalised = error / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-    return Uncertainty(
-        nees=float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0]))),
-        within_1=float(np.mean(np.abs(normalised) <= 1.0)),
-        within_2=float(np.mean(np.abs(normalised) <= 2.0)),
-    )
+    squared = np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
+    normalised = np.abs(error) / np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return Uncertainty(float(squared.mean()), *(float(np.mean(normalised <= stds)) for stds in (1.0, 2.0)))
 
 
 def angle_error(estimated: np.ndarray, true: np.ndarray) -> AngleError:
@@ -280,18 +268,14 @@ def angle_error(estimated: np.ndarray, true: np.ndarray) -> AngleError:
 
 
 def compute_icc(ratings: np.ndarray) -> float:
-    """Compute ICC(A,1) of n subjects by k raters (n, k): McGraw and Wong 1996, the ICC(2,1) of Shrout and Fleiss 1979.
-
-    NaN where nothing varies.
-    """
+    """Compute ICC(A,1) of n subjects by k raters (n, k), McGraw and Wong 1996; NaN where nothing varies."""
     n, k = ratings.shape
     if n < 2:
         return float("nan")
-    mean = ratings.mean()
-    rows = k * ((ratings.mean(axis=1) - mean) ** 2).sum() / (n - 1)
-    columns = n * ((ratings.mean(axis=0) - mean) ** 2).sum() / (k - 1)
-    rest = ratings - ratings.mean(axis=1, keepdims=True) - ratings.mean(axis=0) + mean
-    error = (rest**2).sum() / ((n - 1) * (k - 1))
+    mean, by_row, by_rater = ratings.mean(), ratings.mean(axis=1, keepdims=True), ratings.mean(axis=0)
+    rows = k * ((by_row - mean) ** 2).sum() / (n - 1)
+    columns = n * ((by_rater - mean) ** 2).sum() / (k - 1)
+    error = ((ratings - by_row - by_rater + mean) ** 2).sum() / ((n - 1) * (k - 1))
     spread = rows + (k - 1) * error + k * (columns - error) / n
     return float((rows - error) / spread) if spread > 0.0 else float("nan")
 

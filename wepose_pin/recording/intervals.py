@@ -61,7 +61,7 @@ def _find_slack(time: np.ndarray) -> float:
 # What the options --interval and --phase select ----------------------------------------------------------------------
 
 
-def check_selection(interval: tuple[float, float] | None, phase: str | None) -> None:
+def check_selection(interval: tuple[float, float] | None, phase: str | None = None) -> None:
     """Raise `WrongOption` where the interval [s] does not run forwards, or a phase is given besides."""
     if interval is None:
         return

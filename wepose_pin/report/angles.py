@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
 
-from ..angles import Angles, JointAngles, group_sides
+from ..angles import Angles, group_sides
 from ..angles.movement import MEASURES, Movement
 from ..angles.repetitions import PERCENT, MeanCurve, list_angles
 from .figures import (
@@ -26,11 +26,10 @@ from .figures import (
     styled,
 )
 from .page import MOST_FIGURES, render_page
-from .words import Table, listed, number, plain, plus_minus
+from .words import Table, number, plain, plus_minus
 
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
-FULL_TURN = 2.0 * np.pi - 1e-9
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
 ADVICE = (
     "State another angle by `--main-angle`, a time by `--interval`, or mark repetitions as intervals of a phase and "
@@ -56,26 +55,24 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
 
     Parameters
     ----------
-    tables : by the names of their files, as in the folder
-    figures : of `draw_figures`; the page shows the first of them
+    tables : of `build_tables`
+    figures : of `draw_figures`; the page shows the first of each kind, the folder has all of them
     """
-    over_time = [figure for name, figure in figures.items() if name.startswith("angles")][:1]
+    over_time = next(figure for name, figure in figures.items() if name.startswith("angles"))
     repetitions = [figures["repetitions"]] if "repetitions" in figures else []
-    curves = [name for name in figures if name.startswith("curves")]
-    shown = curves[: MOST_FIGURES - len(over_time) - len(repetitions)]
-    rest = [f"`{name}.svg`" for name in curves[len(shown) :]]
-    further = f" Further figures in the folder: {listed(rest)}." if rest else ""
+    curves = [figure for name, figure in figures.items() if name.startswith("curves")]
+    shown = curves[: MOST_FIGURES - 1 - len(repetitions)]
     missing = explain_missing(movements)
     comparisons = tabulate_comparisons(tables["comparison"])
     return render_page(
         f"Joint angles of {' and '.join(movement.name for movement in movements)}",
         [_describe_reliance(tables["summary"]), tabulate_sessions(tables["sessions"]), _describe(movements)],
         {
-            "Repetitions": [*missing, *([ADVICE] if missing else []), *repetitions],
-            "Mean curves": [CURVES + further, *(figures[name] for name in shown)] if shown else [],
+            "Repetitions": [*missing, *repetitions],
+            "Mean curves": [CURVES, *shown] if shown else [],
             "Means over the repetitions": [tabulate_means(tables["summary"])] if len(tables["summary"]) else [],
             "Sessions compared": [COMPARISON, *comparisons] if comparisons else [],
-            "All of the time": [WHOLE_TIME, *over_time, _tabulate_whole_time(tables["phases"])],
+            "All of the time": [WHOLE_TIME, over_time, _tabulate_whole_time(tables["phases"])],
         },
     )
 
@@ -84,12 +81,11 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
 
 
 def explain_missing(movements: Sequence[Movement]) -> list[str]:
-    """Why a session has no repetitions, of those that have none."""
+    """Why a session has no repetitions, of those that have none, and what to do."""
+    missing = [(each.name, each.repetitions) for each in movements if each.repetitions.reason]
     return [
-        f"{each.name}: no repetitions{f' by {source}' if (source := each.repetitions.source) else ''}: "
-        f"{each.repetitions.reason}."
-        for each in movements
-        if each.repetitions.reason
+        f"{name}: no repetitions{f' by {found.source}' if found.source else ''}: {found.reason}. {ADVICE}"
+        for name, found in missing
     ]
 
 
@@ -126,7 +122,7 @@ def _describe(movements: Sequence[Movement]) -> str:
         f"{filtered} Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1. Without "
         "`wepose track --covariance` a pose states one number for all axes of a segment, and the ± of one angle is "
         "rough. CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1. Angles "
-        "are after the International Society of Biomechanics, with the same signs left and right (`definitions.csv`)."
+        "are after the International Society of Biomechanics, with the same signs left and right."
     )
 
 
@@ -174,10 +170,9 @@ def tabulate_comparisons(comparison: pl.DataFrame) -> list[Table]:
         text = number(value, 1, sign="+", unknown="")
         if np.isfinite(low):
             text += f" ({number(low, 1, sign='+')} to {number(high, 1, sign='+')})"
-            if (low > 0.0 or high < 0.0) and abs(value) > CLEAR * np.nan_to_num(std):
+            if low * high > 0.0 and abs(value) > CLEAR * np.nan_to_num(std):
                 text = f"**{text}**"
-        table = tables.setdefault(f"{row['session']} less {row['against']}", {})
-        table.setdefault(_name(row), []).append(text)
+        tables.setdefault(f"{row['session']} less {row['against']}", {}).setdefault(_name(row), []).append(text)
     return [
         Table(title, ["angle", *HEADINGS], [[angle, *cells] for angle, cells in table.items()])
         for title, table in tables.items()
@@ -219,23 +214,12 @@ def draw_joint_angles(angles: Angles, caption: str = "Joint angles over time.") 
     styles: dict[str, dict[str, Any]] = {}
     for group, members in group_sides(angles.joints).items():
         for k, name in enumerate(angles[next(iter(members.values()))].names):
-            lines = {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
-            panels[f"{plain(group)}: {plain(name)} [°]"] = lines
+            lines = {side: np.where(angles[j].hidden(k), np.nan, angles[j].values[:, k]) for side, j in members.items()}
+            panels[f"{plain(group)}: {plain(name)} [°]"] = {side: np.degrees(line) for side, line in lines.items()}
         styles |= {side: line_style(side, side) for side in members}
     if any((joint.near_lock | joint.gap).any() for joint in angles.joints.values()):
         caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
     return draw_over_time(angles.time, panels, caption, styles, columns=3)
-
-
-def _break_line(joint: JointAngles, k: int) -> np.ndarray:
-    """An angle with its line broken where it is not determined; within ± half a turn where it passed the lock."""
-    hidden = joint.hidden(k)
-    values = np.where(hidden, np.nan, joint.values[:, k])
-    if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
-        return values  # a real whole turn
-    values = (values + np.pi) % FULL_TURN - np.pi
-    values[1:][np.abs(np.diff(values)) > np.pi] = np.nan
-    return values
 
 
 def _session_style(k: int) -> dict[str, Any]:
@@ -262,11 +246,10 @@ def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure
 def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: dict[str, str]) -> ReportFigure:
     """A joint's three angles from 0 to 100 % of the repetition, left above right."""
     first = next(each.angles[joint] for _, each in sessions for joint in members.values() if joint in each.curves)
-    cutoff, alone = sessions[0][1].cutoff_hz, len(sessions) == 1
-    filtered = "not low-passed" if cutoff is None else f"low-passed at {cutoff:g} Hz (half amplitude)"
+    alone = len(sessions) == 1
     figure = ReportFigure(
-        f"The {plain(group)} over the repetition, sequence {'-'.join(first.sequence)}, {filtered}. Line: mean over n "
-        f"repetitions. Band: ± one standard deviation between them.{' Thin: the repetitions.' * alone}",
+        f"The {plain(group)} over the repetition, sequence {'-'.join(first.sequence)}. Line: mean over n repetitions. "
+        f"Band: ± one standard deviation between them.{' Thin: the repetitions.' * alone}",
         1.7 * len(members),
     )
     for row, joint in zip(figure.grid(len(members), 3, sharex=True, sharey="col"), members.values(), strict=True):
@@ -279,8 +262,7 @@ def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: 
     for ax in row:
         ax.set_xlabel("repetition [%]")
         low, high = ax.get_ylim()
-        room = max(0.5 * (10.0 - (high - low)), 0.0)  # at least 10° high
-        ax.set_ylim(low - room, high + room)
+        ax.set_ylim(min(low, 0.5 * (low + high) - 5.0), max(high, 0.5 * (low + high) + 5.0))  # at least 10° high
     figure.add_legend()
     return figure
 

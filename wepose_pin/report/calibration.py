@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration
-from ..calibration.result import MIN_CONTACT, find_intervals
+from ..calibration.result import MIN_CONTACT
 from ..diagnostics import Diagnostic, lines
 from ..errors import WeposeError
 from ..filters import BEST
 from ..recording import Recording, compute_mount, find_mount_axes
-from ..tracking import Tracker, TrackOptions, TrackResult
+from ..tracking import TrackResult, track
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
 from .page import Banner, Item, render_page, write_pages
 from .viewer import show_motion
@@ -30,26 +31,30 @@ QUALITIES = {
 def write_calibration_page(
     folder: Path, calibration: Calibration, recording: Recording, *, method: str
 ) -> list[Diagnostic]:
-    """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
-    return write_pages(
-        folder,
-        {"report.html": lambda: render_calibration_report(calibration, recording, method=method)},
-        "calibration.json",
-    )
+    """Write ``report.html`` beside a calibration's result, as `write_pages`; `method`: as the calibration was run."""
+
+    def make() -> str:
+        tracked = None
+        with contextlib.suppress(WeposeError):  # the paper's formulation estimates no mounts
+            tracked = track(
+                recording, calibration.subject, method=method, model=calibration.problem.model, accept_failed=True
+            )
+        return render_calibration_report(calibration, recording, tracked=tracked, method=method)
+
+    return write_pages(folder, {"report.html": make})
 
 
 def render_calibration_report(
     calibration: Calibration, recording: Recording, *, tracked: TrackResult | None = None, method: str = BEST
 ) -> str:
-    """``report.html``: one page that opens offline and prints; equal arguments give equal text.
+    """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
-    Parameters
-    ----------
-    tracked : the recording tracked with the calibrated subject, for the 3D view; None: it is tracked here
-    method : as the calibration was run
+    `tracked` is the recording tracked with the calibrated subject, for the 3D view; None: there is no view.
     """
-    quality = calibration.quality
+    quality, gap = calibration.quality, capital(_name_gap(calibration))
     entries = lines(quality.further, titled=True)
+    has_gap = np.count_nonzero(np.isfinite(calibration.gap)) > 1
+    motion = None if tracked is None else (tracked.model, tracked.pose, recording.phases, recording.name)
     return render_page(
         f"Calibration of {recording.name or 'a recording'}",
         [
@@ -60,8 +65,8 @@ def render_calibration_report(
         {
             "Lengths": [draw_lengths(calibration), _describe_lengths(calibration), tabulate_lengths(calibration)],
             "Sensors": _list_sensors(calibration),
-            f"{capital(_name_gap(calibration))} over time": _list_gap(calibration),
-            "The motion in 3D": _list_view(calibration, recording, tracked, method),
+            f"{gap} over time": [draw_gap(calibration, gap), describe_gap(calibration)] if has_gap else [],
+            "The motion in 3D": [show_motion(*motion)] if motion else [],
             "What was run": [_tabulate_run(calibration, recording, method)],
         },
     )
@@ -100,16 +105,13 @@ def _describe_reliance(calibration: Calibration) -> str:
 
 
 def _describe_lengths(calibration: Calibration) -> str:
-    """What of the lengths the motion determines, and what it does not."""
+    """Which of the lengths the motion determines, and which it does not."""
     subject, problem = calibration.subject, calibration.problem
     text = "± is one standard deviation throughout: two times out of three the truth lies within."
     if problem.lengths_in_closures and np.isfinite(calibration.scale_std):
         measured = listed([plain(name) for name in problem.scale_lengths])
         scale = f"comes from the measured {measured}" if measured else "is that of the prior"
-        text += (
-            " The motion determines the proportions of the lengths. Their common scale "
-            f"{scale}, to ± {100 * calibration.scale_std:.1f} %."
-        )
+        text += f" The motion determines the proportions of the lengths. Their common scale {scale}."
     outside = [plain(n) for n in subject.lengths if n not in problem.lengths_in_closures and n not in problem.measured]
     if outside:
         text += f" Not in the chain, known by the prior's proportions alone: {', '.join(outside)}."
@@ -149,15 +151,16 @@ def tabulate_mounts(calibration: Calibration) -> Table:
 
 
 def _list_sensors(calibration: Calibration) -> list[Item]:
-    soft = [f"{plain(joint)} {np.degrees(rms):.1f}°" for joint, rms in calibration.hinge_rms.items()]
+    if not calibration.subject.mounts:
+        return []
     text = (
-        "Which axes of each sensor point up and forward, and the angle from there. Nobody stands exactly in the start "
-        "pose: by how much each segment was off was estimated with the lengths. `subject.toml` has the directions, "
-        "and the exact rotations."
+        "Which axes of each sensor point up and forward, and the angle from there; `subject.toml` has the exact "
+        "rotations. Off at start: by how much the segment was off the start pose, which was estimated too."
     )
+    soft = [f"{plain(joint)} {np.degrees(rms):.1f}°" for joint, rms in calibration.hinge_rms.items()]
     if soft:
-        text += f" Out of the plane of its hinge, root mean square, a segment rotates by: {', '.join(soft)}."
-    return [text, tabulate_mounts(calibration)] if calibration.subject.mounts else []
+        text += f" Root mean square rotation out of the plane of a hinge: {', '.join(soft)}."
+    return [text, tabulate_mounts(calibration)]
 
 
 def describe_gap(calibration: Calibration) -> str:
@@ -169,30 +172,6 @@ def describe_gap(calibration: Calibration) -> str:
     )
 
 
-def _list_gap(calibration: Calibration) -> list[Item]:
-    if np.count_nonzero(np.isfinite(calibration.gap)) < 2:
-        return []
-    return [draw_gap(calibration, capital(_name_gap(calibration))), describe_gap(calibration)]
-
-
-def _list_view(calibration: Calibration, recording: Recording, tracked: TrackResult | None, method: str) -> list[Item]:
-    """The motion of the protocol, tracked with what was calibrated."""
-    if not len(calibration.time):
-        return []
-    if tracked is None:
-        try:
-            model, options = calibration.problem.model, TrackOptions(method)
-            tracker = Tracker(calibration.subject, model=model, options=options)
-            tracked = tracker.push(recording) or next(tracker.smooth())
-        except WeposeError as error:
-            return [f"The motion cannot be tracked: {error}"]
-    first, last = calibration.time.min() - 1e-6, calibration.time.max() + 1e-6
-    samples = slice(*np.searchsorted(tracked.time, [first, last]).tolist())
-    if samples.stop - samples.start < 2:
-        return []
-    return [show_motion(tracked.model, tracked.pose.cut(samples), recording.phases, recording.name)]
-
-
 def _tabulate_run(calibration: Calibration, recording: Recording, method: str) -> Table:
     problem, lengths = calibration.problem, calibration.measured_lengths
     measured = [
@@ -200,9 +179,9 @@ def _tabulate_run(calibration: Calibration, recording: Recording, method: str) -
     ]
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("sensors", ", ".join(map(plain, recording.sensors))),
         ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
         ("phases", "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())),
+        ("sensors", ", ".join(map(plain, recording.sensors))),
         ("protocol", f"{problem.protocol.name}, {len(calibration.time)} samples of it"),
         ("filter", method if recording.imus else "none: measured orientations"),
         ("measured lengths", ", ".join(measured) or "none"),
@@ -248,29 +227,21 @@ def draw_lengths(calibration: Calibration) -> ReportFigure:
     return figure
 
 
-@styled
 def draw_gap(calibration: Calibration, label: str) -> ReportFigure:
-    """The gap over time with the prior's and with the estimated lengths; `label` says what it is."""
+    """The gap over time while touching, with the prior's and with the estimated lengths; `label` says what it is."""
     order = np.argsort(calibration.time, kind="stable")
     order = order[np.isfinite(calibration.gap[order])]
-    time, touched = calibration.time[order], calibration.contact[order] >= MIN_CONTACT
-    step = float(np.median(np.diff(time)))
-    jumps = np.flatnonzero(np.diff(time) > 3.0 * step) + 1  # where a line breaks
+    time, touching = calibration.time[order], calibration.contact[order] >= MIN_CONTACT
+    touching |= not touching.any()
+    jumps = np.flatnonzero(np.diff(time) > 3.0 * np.median(np.diff(time))) + 1  # where a line breaks
     gaps, styles = {}, {}
     for name, gap, side, dashes in (
         ("with the prior's lengths", calibration.prior_gap, "left", "--"),
         ("with the estimated lengths", calibration.gap, "right", "-"),
     ):
-        gaps[name] = np.insert(1e3 * gap[order], jumps, np.nan)
+        gaps[name] = np.insert(np.where(touching, 1e3 * gap[order], np.nan), jumps, np.nan)
         styles[name] = {"color": COLOURS[side], "linestyle": dashes, "label": name}
-    figure = draw_over_time(
-        np.insert(time, jumps, time[jumps]),
-        {f"{label} [mm]": gaps},
-        f"{label} over time, before and after.",
-        styles,
-        spans=("apart, left out", [(a - 0.5 * step, b + 0.5 * step) for a, b in find_intervals(time, ~touched)]),
-    )
-    shown = order[touched] if touched.any() else order
-    usual = 1e3 * np.concatenate([calibration.gap[shown], calibration.prior_gap[shown]])
-    figure.axes[0].set_ylim(0.0, 1.12 * float(np.nanmax(usual, initial=1.0)))  # lines may leave the plot while apart
+    caption = f"{label} over time, before and after. Where the line breaks they are apart."
+    figure = draw_over_time(np.insert(time, jumps, time[jumps]), {f"{label} [mm]": gaps}, caption, styles)
+    figure.axes[0].set_ylim(bottom=0.0)
     return figure

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-from ..diagnostics import INFO, WARNING, Diagnostic, as_json, lines
+from ..diagnostics import INFO, WARNING, Diagnostic, lines
 from ..documents import whole_file
 from ..errors import reason
 from ..writers.result import versions
 from .words import Table
+
+if TYPE_CHECKING:  # matplotlib loads only where a figure is drawn
+    from .figures import ReportFigure
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it
 MOST_FIGURES = 5  # of a page; tables have the rest
@@ -38,15 +39,7 @@ class Frame(NamedTuple):
     more: str = ""
 
 
-class Picture(Protocol):
-    """A figure, as `ReportFigure`; matplotlib loads only where one is drawn."""
-
-    caption: str
-
-    def address(self) -> str: ...
-
-
-Item: TypeAlias = str | Banner | Table | Frame | Picture  # a text is a paragraph
+Item: TypeAlias = "str | Banner | Table | Frame | ReportFigure"  # a text is a paragraph
 
 
 def render_page(title: str, lead: Sequence[Item], sections: Mapping[str, Sequence[Item]]) -> str:
@@ -98,32 +91,20 @@ def inline(text: str) -> Markup:
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", marked))
 
 
-def write_pages(folder: Path, pages: Mapping[str, Callable[[], str]], summary: str = "") -> list[Diagnostic]:
-    """Write pages beside results that are there already, each whole or not at all; those of an earlier run go first.
+def write_pages(folder: Path, pages: Mapping[str, Callable[[], str]]) -> list[Diagnostic]:
+    """Write pages beside a result, each whole or not at all; return a diagnostic for each that cannot be made.
 
-    Parameters
-    ----------
-    pages : name of a file → what makes its text
-    summary : JSON file of the result, whose ``diagnostics`` get those of pages that cannot be made, which are returned
+    `pages`: file name → what makes its text. Pages of an earlier result are removed first.
     """
     for name in pages:
-        with contextlib.suppress(OSError):
-            (folder / name).unlink()
+        (folder / name).unlink(missing_ok=True)
     diagnostics = []
     for name, make in pages.items():
         try:
-            _write(folder / name, make())
-        except Exception as error:
+            text = make()
+            with whole_file(folder / name) as partial:
+                partial.write_text(text, encoding="utf-8")
+        except Exception as error:  # the result is complete without its pages
             facts = {"reason": f"cannot be made: {reason(error)}"}
             diagnostics.append(Diagnostic("output-incomplete", WARNING, name, facts=facts))
-    if diagnostics and summary:
-        with contextlib.suppress(Exception):  # a full disk, say: what is there stays as it was
-            content: dict[str, Any] = json.loads((folder / summary).read_text(encoding="utf-8"))
-            content["diagnostics"] = [*content.get("diagnostics", []), *map(as_json, diagnostics)]
-            _write(folder / summary, json.dumps(content, indent=2) + "\n")
     return diagnostics
-
-
-def _write(file: Path, text: str) -> None:
-    with whole_file(file, force=True) as partial:
-        partial.write_text(text, encoding="utf-8")

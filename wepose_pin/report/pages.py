@@ -7,7 +7,7 @@ import sys
 import tempfile
 import webbrowser
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def write_track_pages(
         return render_track_report(summary, view=make_view() if view else None)
 
     pages: dict[str, Callable[[], str]] = {"view.html": make_view} if view else {}
-    return write_pages(folder, pages | ({"report.html": make_report} if report else {}), "summary.json")
+    return write_pages(folder, pages | ({"report.html": make_report} if report else {}))
 
 
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:
@@ -55,7 +55,7 @@ def save_result(result: TrackResult, folder: str | Path, force: bool = False) ->
         summary, options = summarize(result), result.options
         # Inputs and options of `track`, under the names that they have in `wepose track`.
         inputs = {"session": result.recording.source, "subject": result.subject.name, "model": result.model.table.name}
-        inputs |= {field.name: getattr(options, field.name) for field in fields(options)}
+        inputs |= {each.name: getattr(options, each.name) for each in fields(options)}
         write_result(partial, result, summary, provenance=collect_provenance(CALL, inputs))
     write_track_pages(out, summary)
     return out
@@ -66,17 +66,11 @@ class ViewPage:
     """The page that plays a motion, which opens offline; a notebook shows it in a frame."""
 
     title: str  # of the motion
-    html: str
-
-    def __repr__(self) -> str:
-        return f"ViewPage({self.title!r}, {len(self.html) / 1e6:.1f} MB)"
+    html: str = field(repr=False)
 
     def _repr_html_(self) -> str:
-        style = f"width:100%;height:{FRAME_HEIGHT}px;border:0"
-        return (
-            f'<iframe title="{escape(self.title)}" sandbox="allow-scripts" style="{style}" '
-            f'srcdoc="{escape(self.html)}"></iframe>'
-        )
+        look = f'sandbox="allow-scripts" style="width:100%;height:{FRAME_HEIGHT}px;border:0"'
+        return f'<iframe title="{escape(self.title)}" {look} srcdoc="{escape(self.html)}"></iframe>'
 
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Write the page to a file and return its path; `ExistingOutput` where it is there, without `force`."""
@@ -93,7 +87,6 @@ class ViewPage:
 def show_result(result: TrackResult, open: bool = True) -> ViewPage:
     """Return the page that plays the motion, and open it in the browser where `open` and this is no notebook."""
     page = ViewPage(result.name, pose_html(result.model, result.pose, phases=result.phases, title=result.name))
-    find_shell = getattr(sys.modules.get("IPython"), "get_ipython", None)
-    if open and not (find_shell is not None and hasattr(find_shell(), "kernel")):
+    if open and "ipykernel" not in sys.modules:
         page.open()
     return page

@@ -101,18 +101,6 @@ def tabulate_hands(summary: Mapping[str, Any]) -> list[Table]:
     ]
 
 
-def describe_limits(summary: Mapping[str, Any]) -> str:
-    """What of the limits was never used."""
-    unused = summary["limit_margins"]
-    return (
-        f"Never used: {100 * unused['velocity_share']:.1f} % of the velocity limits, "
-        f"{100 * unused['acceleration_share']:.1f} % of those of acceleration, {100 * unused['jerk_share']:.1f} % of "
-        f"those of jerk; {unused['position_rad']:.3f} rad to the nearest position limit. In "
-        f"{100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked: no other kept all limits and "
-        "left it a way to stop."
-    )
-
-
 def _describe_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> str:
     distance, contacts = trajectory.run.report.hull_distance, summary["self_collisions"]
     text = "Distances are those of convex hulls, which are larger than the parts."
@@ -142,10 +130,10 @@ def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Ite
     return [
         draw_joints(trajectory),
         Table("", ["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
-        describe_limits(summary),
         f"Limits are those of the robot's map, else of its URDF. {100 * margins.speed_scale:g} % of those of velocity, "
         f"acceleration and jerk are used (`--speed-scale`), and {margins.limit_margin:g} rad are left to each position "
-        "limit (`--limit-margin`).",
+        f"limit (`--limit-margin`). In {100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked, "
+        "to keep all limits and a way to stop.",
     ]
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -42,7 +41,7 @@ from .figures import (
 )
 from .page import Frame, Item, render_page, show_diagnostics
 from .viewer import show_motion
-from .words import Table, capital, intervals, kinds, listed, number, plain, plural, spread
+from .words import Table, intervals, kinds, listed, number, plain, plural, spread
 
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
@@ -66,9 +65,8 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
     with contextlib.suppress(BadData):  # no joint has both of its segments
         angles = joint_angles(tracked.pose, AUTO)
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
-    if view is not None and len(view) <= LARGEST_VIEW:
-        frame = Frame(view)
-    else:
+    frame = Frame(view or "")
+    if view is None or len(view) > LARGEST_VIEW:
         frame = show_motion(tracked.model, tracked.pose, recording.phases, recording.name)
     return render_page(
         f"Motion of {recording.name or 'a recording'}",
@@ -80,7 +78,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
         {
             "What was recorded": _list_recorded(tracked, measures),
             "Drift of the headings": _list_drift(tracked, measures.headings),
-            f"The {_name_tips(table)}": _list_tips(tracked, measures),
+            f"The {_name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
             "The motion in 3D": [frame],
             "What was run": [_tabulate_run(tracked)],
@@ -96,32 +94,30 @@ def _describe_reliance(tracked: TrackResult, measures: Measures, angles: Angles 
     after_start, table = find_samples_after_start(tracked), tracked.model.table
     stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
     for joint, each in angles.joints.items() if angles is not None else ():
-        for k, angle in enumerate(each.names if each.std is not None else ()):
-            assert each.std is not None
+        for k, angle in enumerate(each.names):
             name = f"{plain(table.shared_name(joint))} {plain(angle)}"
-            std = float(np.degrees(finite_median(each.std[after_start & ~each.hidden(k), k])))
+            known = after_start & ~each.hidden(k)
+            std = np.nan if each.std is None else float(np.degrees(finite_median(each.std[known, k])))
             if np.isfinite(std):
                 stds[name] = max(std, stds.get(name, 0.0))
     hinges = [f"{plain(table.shared_name(hinge))} flexion" for hinge in table.hinges]
     best = next((name for name in stds if name in hinges), min(stds, key=stds.__getitem__, default=None))
     worst = max(stds, key=stds.__getitem__, default=None)
-    known = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
+    good = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
     tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
-    if tips and np.isfinite(tips).any():
+    if np.isfinite(tips).any():
         root = "the root" if table.is_mechanism else "the middle of the hips"
-        known.append(f"{_name_tips(table)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
-    known += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
-    if not known:
-        return _explain_no_covariance(tracked)
+        good.append(f"{_name_tips(table, table.drawn_limbs)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
+    good += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
     least = f" Least certain: {worst}, ± {stds[worst]:.0f}°." if worst not in (best, None) else ""
-    return f"**Good for** {listed(known)}.{least}"
+    return f"**Good for** {listed(good)}.{least}" if good else _explain_no_covariance(tracked)
 
 
 def _explain_no_covariance(tracked: TrackResult) -> str:
     source = f"The filter {tracked.options.method}" if tracked.recording.imus else "The device"
     return (
-        f"{source} states no uncertainty, so that this page cannot say how far angles and positions may be off. "
-        f"The methods amekf, smoother, smekf and smekf_published state it."
+        f"{source} states no uncertainty, so this page cannot say how far angles and positions may be off. The methods "
+        "amekf, smoother, smekf and smekf_published state it."
     )
 
 
@@ -159,10 +155,10 @@ def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
             cells.append(f"{signal.gravity:.3f} m/s²")
         rows.append([plain(name), *cells])
     header = ["sensor", "fastest rotation", "saturated", "lost", "static", "longest motion"]
-    low, high = (f"{step:.2f}" for step in measures.steps_ms)
+    steps = " to ".join(dict.fromkeys(f"{step:.2f}" for step in measures.steps_ms))
     return [
-        f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'}"
-        f" ms.{f' Phases: {phases}.' if phases else ''}",
+        f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {steps} ms."
+        f"{f' Phases: {phases}.' if phases else ''}",
         draw_timeline(tracked, measures.signals),
         Table("", [*header, "bias at first", "bias at the end", "gravity"], rows),
         "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
@@ -185,8 +181,6 @@ def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> lis
             f" What the joints and joined hands show corrected the headings by up to {most:.1f}°. This does not "
             "correct errors that all segments share, such as the heading of the whole person."
         )
-    if has_stated_mounts(tracked):
-        text += " A mount that is stated and not calibrated is as uncertain as people are off the start pose."
     stds = {name: heading.std for name, heading in headings.items()}
     rows = []
     for name, std in [*stds.items(), *compute_joint_heading_stds(headings, tracked.model).items()]:
@@ -204,21 +198,19 @@ def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> lis
 
 
 def _list_tips(tracked: TrackResult, measures: Measures) -> list[Item]:
-    groups = group_tips(measures.tips, tracked.model.table)
-    if not groups:
-        return []
-    after_start = find_samples_after_start(tracked)
-    items: list[Item] = list(draw_tips(tracked.time, groups, tracked.model.table).values())
-    for group in groups:
+    table, after_start = tracked.model.table, find_samples_after_start(tracked)
+    items: list[Item] = list(draw_tips(tracked.time, measures.tips, table).values())
+    for title, tips in group_tips(measures.tips, table).items():
         rows = []
-        for name, tip in group.tips.items():
+        for name, tip in tips.items():
             low, high = np.nanpercentile(100 * tip.reach, [1.0, 99.0], axis=0)
             ranges = [f"{number(a, 0)} to {number(b, 0)}" for a, b in zip(low, high, strict=True)]
             std = np.full(1, np.nan) if tip.std is None else 1e3 * tip.std[after_start]
             stds = [spread(each(std), 0, " mm") for each in (finite_median, finite_max)]
             rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *stds])
-        title = f"The {group.nouns}, from {group.start} along {group.frame}"
-        items.append(Table(title, ["", *AXES, "highest speed", "median ±", "largest ±"], rows))
+        items.append(Table(f"The {title}", ["", *AXES, "highest speed", "median ±", "largest ±"], rows))
+    if not items:
+        return []
     items.append(
         "Ranges hold 98 % of the time; the highest speed is the mean of a tenth of a second. The ± is of one axis, "
         "relative to the root, and includes the lean and the lengths of all that lies between."
@@ -281,9 +273,8 @@ def _tabulate_run(tracked: TrackResult) -> Table:
 def draw_figures(result: TrackResult) -> Figures:
     """Draw the paths of the hands and their reach, and the joint angles, of what is known; as `TrackResult.plot`."""
     figures, table = Figures(), result.model.table
-    tips = measure_tips(result.pose, result.rate_hz, table) if len(result.time) > 1 else {}
-    if tips:
-        figures |= draw_tips(result.time, group_tips(tips, table), table)
+    if len(result.time) > 1:
+        figures |= draw_tips(result.time, measure_tips(result.pose, result.rate_hz, table), table)
     with contextlib.suppress(BadData):  # no joint has both of its segments
         figures["angles"] = draw_joint_angles(joint_angles(result.pose, AUTO))
     return figures
@@ -325,42 +316,34 @@ def draw_timeline(tracked: TrackResult, signals: Mapping[str, Signal]) -> Report
     return figure
 
 
-class TipGroup(NamedTuple):
-    """Points whose paths are drawn together, for their limbs hang on the same points; texts are in words."""
-
-    tips: Mapping[str, TipMotion]
-    nouns: str  # what the points are on, as "hands"
-    start: str  # where a reach begins, as "the middle of the shoulders"
-    frame: str  # whose axes its coordinates are along
-
-
-def group_tips(tips: Mapping[str, TipMotion], table: BodyTable) -> list[TipGroup]:
-    """The tips by the points at which their limbs hang."""
-    limbs, groups = table.drawn_limbs, []
-    for origin in dict.fromkeys(limbs[name].origin for name in tips):
-        own = {name: tip for name, tip in tips.items() if limbs[name].origin == origin}
-        start, base = plain(table.shared_name(origin[0])), limbs[next(iter(own))].base
-        start = f"the middle of the {plural(start)}" if len(origin) > 1 else f"the {start}"
+def group_tips(tips: Mapping[str, TipMotion], table: BodyTable) -> dict[str, dict[str, TipMotion]]:
+    """Group points by where their limbs begin: what the points are on and where a reach begins, in words → points."""
+    groups: dict[str, dict[str, TipMotion]] = {}
+    for origin in dict.fromkeys(table.drawn_limbs[name].origin for name in tips):
+        own = {name: tip for name, tip in tips.items() if table.drawn_limbs[name].origin == origin}
+        base, start = table.drawn_limbs[next(iter(own))].base, plain(table.shared_name(origin[0]))
+        start = f"middle of the {plural(start)}" if len(origin) > 1 else start
         frame = f"the {plain(base)}'s own axes" if base else "the axes of W"
-        groups.append(TipGroup(own, _name_tips(table, own), start, frame))
+        groups[f"{_name_tips(table, own)}, from the {start} along {frame}"] = own
     return groups
 
 
-def _name_tips(table: BodyTable, names: Mapping[str, Any] | None = None) -> str:
-    """What these points whose path is drawn, or all, are on, as "hands"."""
-    limbs = table.drawn_limbs
-    return listed(kinds(table, [(limbs[name].segments or (name,))[-1] for name in names or limbs]))
+def _name_tips(table: BodyTable, points: Iterable[str]) -> str:
+    """What these points whose path is drawn are on, as "hands"."""
+    return listed(kinds(table, [(table.drawn_limbs[name].segments or (name,))[-1] for name in points]))
 
 
 @styled
-def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) -> dict[str, ReportFigure]:
+def draw_tips(time: np.ndarray, tips: Mapping[str, TipMotion], table: BodyTable) -> dict[str, ReportFigure]:
     """Draw "paths", the tips seen from the front, the right and above, and "reach", the tips over time."""
-    nouns = listed([group.nouns for group in groups])
-    paths = ReportFigure(f"Paths of the {nouns}, seen from the body; a mark shows the beginning.", 2.7 * len(groups))
-    styles: dict[str, dict[str, Any]] = {}
+    groups = group_tips(tips, table)
+    if not groups:
+        return {}
+    caption = f"The {'; the '.join(groups)}"
+    paths = ReportFigure(f"{caption}: paths. A mark shows the beginning.", 2.7 * len(groups))
+    styles = {name: line_style(name, table.side(name)) for name in tips}
     panels: dict[str, dict[str, np.ndarray]] = {}
-    for axes, group in zip(paths.grid(len(groups), 3), groups, strict=True):
-        styles |= {name: line_style(name, table.side(name)) for name in group.tips}
+    for axes, (title, group) in zip(paths.grid(len(groups), 3), groups.items(), strict=True):
         for ax, (view, across, up) in zip(axes, VIEWS, strict=True):
             ax.set_title(view)
             ax.set_xlabel(AXES[across])
@@ -369,14 +352,13 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
             ax.margins(0.05)
             if view == "from above":
                 ax.invert_xaxis()
-            ax.plot(0.0, 0.0, "+", color=SOFT, markersize=10, label=group.start)
-            for name, tip in group.tips.items():
+            ax.plot(0.0, 0.0, "+", color=SOFT, markersize=10, label="where the reach begins")
+            for name, tip in group.items():
                 at = 100.0 * tip.reach[:: max(1, len(tip.reach) // PATH_POINTS)][:, [across, up]]
                 ax.plot(at[:, 0], at[:, 1], **{**styles[name], "linewidth": 0.7})
                 ax.plot(at[:1, 0], at[:1, 1], "s" if table.side(name) == "right" else "o", color=styles[name]["color"])
         for k, label in enumerate(AXES):
-            title = label if len(groups) == 1 else f"{group.nouns}: {label}"
-            panels[title] = {name: 100.0 * tip.reach[:, k] for name, tip in group.tips.items()}
+            heading = label if len(groups) == 1 else f"{title.partition(',')[0]}: {label}"
+            panels[heading] = {name: 100.0 * tip.reach[:, k] for name, tip in group.items()}
     paths.add_legend()
-    caption = "; ".join(f"the {group.nouns} from {group.start} along {group.frame}" for group in groups)
-    return {"paths": paths, "reach": draw_over_time(time, panels, capital(f"{caption}, over time."), styles)}
+    return {"paths": paths, "reach": draw_over_time(time, panels, f"{caption}: over time.", styles)}

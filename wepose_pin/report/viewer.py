@@ -12,7 +12,8 @@ import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import distribution
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from markupsafe import Markup
@@ -44,11 +45,12 @@ LIGHTS = (  # meshcat's own; positions in W [m]
 )
 GHOST_OPACITY = 0.35  # of a hand at its target
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
-
-
 # Colours behind the body, red, green, blue from 0 to 1.
 LIGHT = {"top": (0.985, 0.99, 0.995), "bottom": (0.89, 0.91, 0.935), "grid": (0.70, 0.74, 0.79)}
 DARK = {"top": (0.085, 0.105, 0.130), "bottom": (0.135, 0.160, 0.190), "grid": (0.30, 0.34, 0.39)}
+
+
+Phases: TypeAlias = Mapping[str, Sequence[tuple[float, float]]]  # name → spans (begin, end) [s]
 
 
 class Trail(NamedTuple):
@@ -71,7 +73,7 @@ def pose_html(
     model: BodyModel,
     pose: Pose,
     *,
-    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    phases: Phases = MappingProxyType({}),
     title: str = "",
     fps: float = 30.0,
 ) -> str:
@@ -83,27 +85,21 @@ def pose_html(
     frames = frame_indices(pose.time, fps)
     visuals, placed = _place_body(model, pose, frames)
     paths = [name for name in model.table.draw.paths if name in pose.points]
+    angles = {}
+    with contextlib.suppress(BadData):  # no joint has both of its segments
+        for joint, each in joint_angles(pose.cut(frames), AUTO).joints.items():
+            for k, name in enumerate(each.names):
+                angles[plain(f"{joint} {name}")] = np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))
     return view_html(
         visuals,
         pose.time[frames],
         placed,
         trails={name: Trail(pose.points[name][frames], choose_trail_colour(name, model)) for name in paths},
-        angles=_compute_angles(pose.cut(frames)),
+        angles=angles,
         phases=phases,
         title=title,
         floor_z=find_floor(model),
     )
-
-
-def _compute_angles(pose: Pose) -> dict[str, np.ndarray]:
-    """Joint and angle in words → values (n,) [deg], NaN where an angle is not determined."""
-    with contextlib.suppress(BadData):  # no joint has both of its segments
-        return {
-            plain(f"{joint} {name}"): np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))
-            for joint, each in joint_angles(pose, AUTO).joints.items()
-            for k, name in enumerate(each.names)
-        }
-    return {}
 
 
 def _place_body(
@@ -118,7 +114,7 @@ def _place_body(
     return visuals, compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
 
 
-def show_motion(model: BodyModel, pose: Pose, phases: Mapping[str, Sequence[tuple[float, float]]], title: str) -> Frame:
+def show_motion(model: BodyModel, pose: Pose, phases: Phases, title: str) -> Frame:
     """A motion inside a report, in fewer frames a second where it is long; parameters as `pose_html`."""
     fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(pose.time[-1] - pose.time[0]), 1e-3))
     rate = f" Here at {fps:.1f} frames a second." if fps < FRAMES_A_SECOND else ""
@@ -132,7 +128,8 @@ def find_floor(model: BodyModel) -> float:
     lengths = np.array(list(model.lengths.values()))
     ways = model.reaches.values()
     heights = [sum(float(part.by_length[2] @ lengths + part.constant[2]) for part in way.values()) for way in ways]
-    return min(heights, default=FLOOR_Z) if min(heights, default=FLOOR_Z) < FEET_Z else FLOOR_Z
+    lowest = min(heights, default=FLOOR_Z)
+    return lowest if lowest < FEET_Z else FLOOR_Z
 
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
@@ -182,9 +179,9 @@ def view_html(
     placements: Mapping[str, tuple[np.ndarray, np.ndarray]],
     *,
     meshes: Sequence[Mesh] = (),
-    trails: Mapping[str, Trail] | None = None,
-    angles: Mapping[str, np.ndarray] | None = None,
-    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    trails: Mapping[str, Trail] = MappingProxyType({}),
+    angles: Mapping[str, np.ndarray] = MappingProxyType({}),
+    phases: Phases = MappingProxyType({}),
     title: str = "",
     floor_z: float = FLOOR_Z,
 ) -> str:
@@ -198,12 +195,10 @@ def view_html(
     time : (n,) [s], n >= 1, rising
     placements : link → (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]); a link is hidden while its placement is NaN
     trails, angles : point → its way; name → (n,) [deg], shown beside the body
-    phases : name → spans (begin, end) [s]
     floor_z : height [m] of the ground grid in W
     """
     time = np.asarray(time, dtype=float)
-    trails = trails or {}
-    drawn = visible(v for v in visuals if v.link in placements)
+    drawn = visible(visual for visual in visuals if visual.link in placements)
     meshes = [mesh for mesh in meshes if mesh.link in placements]
     links = list(dict.fromkeys([*(v.link for v in drawn), *(mesh.link for mesh in meshes)]))
     motion = np.empty((len(links), len(time), 7), dtype="<f4")  # quat_WL xyzw, p_WL
@@ -216,11 +211,8 @@ def view_html(
         "links": links,
         "motion": _base64(motion),
         "trails": [{"name": name, "colour": t.colour, "points": _base64(t.points)} for name, t in trails.items()],
-        "angles": [{"name": name, "values": _base64(values)} for name, values in (angles or {}).items()],
-        "phases": [
-            {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
-            for name, spans in (phases or {}).items()
-        ],
+        "angles": [{"name": name, "values": _base64(values)} for name, values in angles.items()],
+        "phases": [{"name": name, "spans": [[*map(float, span)] for span in each]} for name, each in phases.items()],
         "view": view([*drawn, *map(_find_box, meshes)], links, motion, [trail.points for trail in trails.values()]),
         "scene": scene(drawn, links, meshes),
         "backdrop": backdrop(LIGHT, floor_z),
@@ -234,12 +226,8 @@ def filled(template: str, data: Mapping[str, Any], title: str) -> str:
 
 
 def visible(visuals: Iterable[Visual]) -> list[Visual]:
-    """The visuals that can be drawn; a dark body (human-gazebo: 0.1 grey) would be a silhouette, and is lightened."""
-    drawn = [v for v in visuals if v.kind != "mesh"]
-    if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
-        rgba = [(0.4 + 0.6 * r, 0.4 + 0.6 * g, 0.4 + 0.6 * b, opacity) for r, g, b, opacity in (v.rgba for v in drawn)]
-        drawn = [v._replace(rgba=own) for v, own in zip(drawn, rgba, strict=True)]
-    return drawn
+    """The visuals that can be drawn."""
+    return [visual for visual in visuals if visual.kind != "mesh"]
 
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
@@ -251,30 +239,28 @@ def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
 
 def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] = ()) -> dict[str, Any]:
     """Lights, camera and body as static/viewer.js builds them; a part's link is its place in `links`."""
-    return {
-        "fov_deg": FIELD_OF_VIEW_DEG,
-        "lights": [{"name": name, "intensity": value, "position": position} for name, value, position in LIGHTS],
-        "parts": [
-            {
-                "link": links.index(visual.link),
-                "kind": visual.kind,
-                "size": list(map(float, visual.size)),
-                "quat": visual.quat_LV.tolist(),
-                "position": visual.p_LV.tolist(),
-                "rgba": list(map(float, visual.rgba)),
-            }
-            for visual in drawn
-        ],
-        "meshes": [
-            {
-                "link": links.index(mesh.link),
-                "vertices": _base64(mesh.vertices),
-                "triangles": _base64(mesh.triangles, "<u4"),
-                "rgba": list(map(float, mesh.rgba)),
-            }
-            for mesh in meshes
-        ],
-    }
+    parts = [
+        {
+            "link": links.index(visual.link),
+            "kind": visual.kind,
+            "size": list(map(float, visual.size)),
+            "quat": visual.quat_LV.tolist(),
+            "position": visual.p_LV.tolist(),
+            "rgba": list(map(float, visual.rgba)),
+        }
+        for visual in drawn
+    ]
+    solids = [
+        {
+            "link": links.index(mesh.link),
+            "vertices": _base64(mesh.vertices),
+            "triangles": _base64(mesh.triangles, "<u4"),
+            "rgba": list(map(float, mesh.rgba)),
+        }
+        for mesh in meshes
+    ]
+    lights = [{"name": name, "intensity": value, "position": position} for name, value, position in LIGHTS]
+    return {"fov_deg": FIELD_OF_VIEW_DEG, "lights": lights, "parts": parts, "meshes": solids}
 
 
 def backdrop(colours: Mapping[str, tuple[float, float, float]], floor_z: float = FLOOR_Z) -> dict[str, Any]:
