@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin.angles.repetitions import Repetitions, compute_cmc, find_movements, find_repetitions
+from wepose_pin.angles.repetitions import Repetitions, compute_cmc, find_repetitions
 
 RATE = 100.0
 FLEXION = "right_elbow_flexion"
@@ -203,24 +203,3 @@ def test_the_arm_swings_of_a_real_walk_are_found(data: Path) -> None:
     assert np.median(np.diff(repetitions.spans, axis=1)) == pytest.approx(period, rel=0.06)
     assert 38 <= len(repetitions.spans) <= 46
     assert repetitions.spans.min() > 95.0  # none at the table
-
-
-def test_movements_between_rests_are_found_where_no_angle_repeats() -> None:
-    """Circles in random planes, and a long and a short movement of another kind."""
-    rng = np.random.default_rng(4)
-    rate_hz, at = 50.0, [1.0]
-    durations = [12.0, 4.0, 4.4, 3.8, 1.0, 4.2]
-    for duration in durations:
-        at.append(at[-1] + duration + 1.5)
-    time = np.arange(0.0, at[-1], 1.0 / rate_hz)
-    hand = rng.normal(scale=1e-4, size=(len(time), 3))
-    for begin, duration in zip(at, durations, strict=False):
-        share = np.clip((time - begin) / duration, 0.0, 1.0)
-        angle = 2.0 * np.pi * (share - np.sin(2.0 * np.pi * share) / (2.0 * np.pi))
-        axes = np.linalg.qr(rng.normal(size=(3, 2)))[0]
-        hand += 0.2 * ((np.cos(angle) - 1.0)[:, None] * axes[:, 0] + np.sin(angle)[:, None] * axes[:, 1])
-    spans = find_movements(time, hand, np.zeros_like(hand))
-    expected = [(begin, begin + duration) for begin, duration in zip(at, durations, strict=False)][1:]
-    expected = [span for span in expected if span[1] - span[0] > 2.0]
-    np.testing.assert_allclose(spans, expected, atol=0.6)
-    assert len(find_movements(time[: round(20.0 * rate_hz)], hand[: round(20.0 * rate_hz)])) == 0
