@@ -54,15 +54,12 @@ def estimate_couplings(
 ) -> list[Coupling]:
     """Of each joint between two IMUs, from the motion in these spans [s]; none where there is too little.
 
-    Parameters
-    ----------
-    pairs : of neighbouring segments, the one nearer the root first
+    `pairs` are of neighbouring segments, the one nearer the root first.
     """
     pairs = [pair for pair in pairs if set(pair) <= set(recording.imus)]
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
-    samples = find_samples(recording, spans)
-    connected = find_connected(recording, filtered.start, names).include(samples)
-    samples = samples[mask_measured(recording, names, samples) & connected]
+    samples, connected = find_samples(recording, spans), find_connected(recording, filtered.start, names)[0]
+    samples = samples[mask_measured(recording, names, samples) & connected[samples]]
     if not pairs or recording.rate_hz < LEAST_RATE_HZ or len(samples) < LEAST_S * recording.rate_hz:
         return []
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]
@@ -81,14 +78,15 @@ def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]
     if not couplings:
         return prior
     H, off = np.zeros((len(couplings), layout.size)), np.zeros(len(couplings))
+    mean, information = prior
     for row, coupling in enumerate(couplings):
         for name, sign in ((coupling.near, 1.0), (coupling.far, -1.0)):
             i = layout.sensors.index(name)
             H[row, layout.heading[i]], H[row, layout.drift[i]] = sign, sign * coupling.elapsed_s
-        off[row] = H[row] @ (start - prior.mean) + np.angle(np.exp(1j * (coupling.heading - H[row] @ start)))
+        off[row] = H[row] @ (start - mean) + np.angle(np.exp(1j * (coupling.heading - H[row] @ start)))
     weight = np.array([coupling.std**-2 for coupling in couplings])
-    information = prior.information + H.T @ (weight[:, None] * H)
-    return Gaussian(prior.mean + np.linalg.solve(information, H.T @ (weight * off)), information)
+    information = information + H.T @ (weight[:, None] * H)
+    return mean + np.linalg.solve(information, H.T @ (weight * off)), information
 
 
 def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name: str) -> np.ndarray:

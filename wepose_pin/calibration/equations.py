@@ -26,10 +26,9 @@ are zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -39,7 +38,7 @@ from ..body.girdle import PARAMETERS
 from ..body.soft_tissue import LEAST_TWIST_COSINE
 from ..body.table import Vector
 from ..observations.hinges import HingePlane
-from ..observations.paths import BodySymbols, GirdleTerm, express_covariance, express_path
+from ..observations.paths import GirdleTerm, express_covariance, express_path
 from ..observations.symbols import about_z, product, rotate_back, small_rotation
 from .conditions import Constraint, Level, Loop, Pointing
 from .protocols import FreeMotion
@@ -48,23 +47,16 @@ HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the
 GAP_ROWS = 3  # residuals of a sample's condition
 
 
-class Twist(NamedTuple):
-    """A segment's rotation about its long axis `along` (3,) in L', against the segment `above`, both with a sensor.
-
-    `std` [rad/rad] is how far sensors lag behind it, per angle that they show.
-    """
-
-    segment: str
-    above: str
-    along: Vector
-    std: float
+# A segment's rotation about its long axis (3,) in L', against the segment above, both with a sensor: the segment, the
+# one above, the axis, and how far sensors lag behind it, one standard deviation [rad/rad] per angle that they show.
+Twist = tuple[str, str, Vector, float]
 
 
 def find_twists(table: BodyTable, hinges: Sequence[HingePlane], sensors: Sequence[str]) -> tuple[Twist, ...]:
     """Find the twists that hinges show: of the segments above them."""
     tissues = [(hinge, table.segments[hinge.on].soft_tissue) for hinge in hinges]
     return tuple(
-        Twist(hinge.on, tissue.relative_to, hinge.along_on, tissue.per_twist)
+        (hinge.on, tissue.relative_to, hinge.along_on, tissue.per_twist)
         for hinge, tissue in tissues
         if tissue.per_twist and tissue.relative_to in sensors
     )
@@ -85,32 +77,34 @@ class Layout:
     attitude_std: tuple[float, ...] = ()  # [rad] of each orientation about an axis across its segment; ratios matter
     soft: tuple[str, ...] = ()  # sensors on a foam
 
-    length: np.ndarray = field(init=False, compare=False)  # (lengths,) [m]
-    heading: np.ndarray = field(init=False, compare=False)  # (sensors,) ψ [rad]
-    tilt: np.ndarray = field(init=False, compare=False)  # (sensors, 2) ε about x and y of L [rad]
-    drift: np.ndarray = field(init=False, compare=False)  # (sensors,) d [rad/s]
-    hinge: np.ndarray = field(init=False, compare=False)  # (hinges, 2) of its axis along `across` and `tilted`
-    foam: np.ndarray = field(init=False, compare=False)  # (soft, 9) A [rad], column by column
-    twist: np.ndarray = field(init=False, compare=False)  # (twists,) g
-    girdle: np.ndarray = field(init=False, compare=False)  # (girdles, 7) `model.girdle.PARAMETERS`
-    point: np.ndarray = field(init=False, compare=False)  # (fixed, 3) of W [m]
-    height: np.ndarray = field(init=False, compare=False)  # (planes,) of W [m]
-    size: int = field(init=False, compare=False)  # of x
+    # The places of each unknown in x, and their number.
+    length: np.ndarray = field(init=False, compare=False)
+    heading: np.ndarray = field(init=False, compare=False)
+    tilt: np.ndarray = field(init=False, compare=False)
+    drift: np.ndarray = field(init=False, compare=False)
+    hinge: np.ndarray = field(init=False, compare=False)
+    foam: np.ndarray = field(init=False, compare=False)
+    twist: np.ndarray = field(init=False, compare=False)
+    girdle: np.ndarray = field(init=False, compare=False)
+    point: np.ndarray = field(init=False, compare=False)
+    height: np.ndarray = field(init=False, compare=False)
+    size: int = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         sensors, begin = len(self.sensors), 0
-        for name, shape in {
-            "length": (len(self.lengths),),
-            "heading": (sensors,),
-            "tilt": (sensors, 2),
-            "drift": (sensors,),
-            "hinge": (len(self.hinges), 2),
-            "foam": (len(self.soft), 9),
-            "twist": (len(self.twists),),
-            "girdle": (len(self.girdles), len(PARAMETERS)),
-            "point": (self.fixed, 3),
-            "height": (self.planes,),
-        }.items():
+        shapes = {
+            "length": (len(self.lengths),),  # [m]
+            "heading": (sensors,),  # ψ [rad]
+            "tilt": (sensors, 2),  # ε about x and y of L [rad]
+            "drift": (sensors,),  # d [rad/s]
+            "hinge": (len(self.hinges), 2),  # of its axis along `across` and `tilted`
+            "foam": (len(self.soft), 9),  # A [rad], column by column
+            "twist": (len(self.twists),),  # g
+            "girdle": (len(self.girdles), len(PARAMETERS)),  # `body.girdle.PARAMETERS`
+            "point": (self.fixed, 3),  # of W [m]
+            "height": (self.planes,),  # of W [m]
+        }
+        for name, shape in shapes.items():
             places = begin + np.arange(np.prod(shape, dtype=int)).reshape(shape)
             object.__setattr__(self, name, places)
             begin += places.size
@@ -143,9 +137,7 @@ def sample_functions(layout: Layout, condition: Constraint) -> tuple[ca.Function
     quat_WL = _orient_segments(layout, x, data)
     r, gap, hinges = ca.SX.zeros(GAP_ROWS), ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
     if isinstance(condition, Loop):
-        girdles = {g.name: (g, x[own]) for g, own in zip(layout.girdles, layout.girdle, strict=True)}
-        body = BodySymbols(quat_WL, x[layout.length], girdles)
-        r, gap = _closure_residual(layout, condition, body, x, data[layout.place])
+        r, gap = _closure_residual(layout, condition, quat_WL, x, data[layout.place])
     elif isinstance(condition, Pointing):
         r = condition.residual(quat_WL)
     elif isinstance(condition, Level):
@@ -184,12 +176,15 @@ def _start_rotation(layout: Layout, x: ca.SX, segment: str) -> ca.SX:
     return small_rotation(ca.vertcat(tilt, 0.0))
 
 
-def _closure_residual(layout: Layout, loop: Loop, body: BodySymbols, x: ca.SX, recorded: ca.SX) -> tuple[ca.SX, ca.SX]:
+def _closure_residual(
+    layout: Layout, loop: Loop, quat_WL: Mapping[str, ca.SX], x: ca.SX, recorded: ca.SX
+) -> tuple[ca.SX, ca.SX]:
     """Return the whitened residual (3,) and the gap (3,) [m] of a closure; `recorded` (3,) [m] is a recorded place."""
     attitude_std = dict(zip(layout.sensors, layout.attitude_std, strict=True))
+    girdles = {g.name: (g, x[own]) for g, own in zip(layout.girdles, layout.girdle, strict=True)}
     gaps, covariances = [], []
     for path in loop.paths:
-        gap, vectors = express_path(path, body)
+        gap, vectors = express_path(path, quat_WL, x[layout.length], girdles)
         gaps.append(gap)
         covariances.append(express_covariance(vectors, loop.closure.slip, attitude_std))
     if loop.kind == "plane":

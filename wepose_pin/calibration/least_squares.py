@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ..errors import NoSolution
 from .conditions import Constraint, Level, Loop, Pointing
-from .equations import GAP_ROWS, Layout, sample_functions
+from .equations import Layout, sample_functions
 
 MIN_LENGTH = 0.01  # [m] below which a length has not converged
 STEPS = 60
@@ -26,12 +26,7 @@ _QUIET_QP = _QUIET | dict.fromkeys(("print_iter", "print_info"), False)
 _QUIET_NLP = _QUIET | dict.fromkeys(("print_iteration", "print_status", "show_eval_warnings"), False)
 _BLAS = "classic" if ca.has_blas("classic") else "reference"
 
-
-class Gaussian(NamedTuple):
-    """A normal distribution of x, of m unknowns."""
-
-    mean: np.ndarray  # (m,)
-    information: np.ndarray  # (m, m), the inverse of the covariance
+Gaussian = tuple[np.ndarray, np.ndarray]  # a normal distribution of x: mean (m,) and information (m, m)
 
 
 @dataclass(frozen=True)
@@ -88,49 +83,31 @@ class Observations:
         return np.asarray(self.residuals(x)[1]).T
 
 
-class LeastSquares(NamedTuple):
-    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c), to be made least.
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c) at one x, to be made least."""
 
-    Parameters
-    ----------
-    observations : the samples, whose residuals are r
-    prior : c and Λ
-    weights : w (n, k)
-    """
-
-    observations: Observations
-    prior: Gaussian
-    weights: np.ndarray
+    observations: Observations  # n samples, each with k residuals r
+    prior: Gaussian  # c and Λ
+    weights: np.ndarray  # w (n, k)
+    x: np.ndarray  # (m,)
 
     @property
     def lower_bounds(self) -> np.ndarray:
         """(m,) of x: no length is below `MIN_LENGTH`, all else is free."""
-        bounds = np.full(self.observations.layout.size, -np.inf)
+        bounds = np.full(len(self.x), -np.inf)
         bounds[self.observations.layout.length] = MIN_LENGTH
         return bounds
 
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A least squares at one x (m,)."""
-
-    problem: LeastSquares
-    x: np.ndarray
-
     @cached_property
     def _residuals(self) -> tuple[np.ndarray, np.ndarray]:
-        r, gaps = self.problem.observations.residuals(self.x)
+        r, gaps = self.observations.residuals(self.x)
         return np.asarray(r).T, np.asarray(gaps).T
 
     @property
     def residuals(self) -> np.ndarray:
-        """(n, k) of the samples."""
+        """(n, k) of the samples; the first three are those of a closure, whitened, or of another condition."""
         return self._residuals[0]
-
-    @property
-    def closure(self) -> np.ndarray:
-        """(n, 3) whitened residuals of the gap, or those of another condition."""
-        return self.residuals[:, :GAP_ROWS]
 
     @property
     def gaps(self) -> np.ndarray:
@@ -140,13 +117,13 @@ class Estimate:
     @cached_property
     def jacobian(self) -> np.ndarray:
         """(n, k, m) of the residuals."""
-        return np.asarray(self.problem.observations.jacobian(self.x)).T.reshape(*self.residuals.shape, -1)
+        return np.asarray(self.observations.jacobian(self.x)).T.reshape(*self.residuals.shape, -1)
 
     @cached_property
     def information(self) -> np.ndarray:
         """JᵀWJ + Λ (m, m)."""
         J = self.jacobian.reshape(-1, len(self.x))
-        return (J.T * self.problem.weights.ravel()) @ J + self.problem.prior.information
+        return (J.T * self.weights.ravel()) @ J + self.prior[1]
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -156,30 +133,29 @@ class Estimate:
     @property
     def cost(self) -> float:
         """Twice what is made least."""
-        off = self.x - self.problem.prior.mean
-        return float(np.sum(self.problem.weights * self.residuals**2) + off @ self.problem.prior.information @ off)
+        off = self.x - self.prior[0]
+        return float(np.sum(self.weights * self.residuals**2) + off @ self.prior[1] @ off)
 
     @property
     def gradient(self) -> np.ndarray:
         """(m,) of half the cost."""
-        weighted = (self.problem.weights * self.residuals).ravel()
-        mean, information = self.problem.prior
+        weighted, (mean, information) = (self.weights * self.residuals).ravel(), self.prior
         return self.jacobian.reshape(-1, len(self.x)).T @ weighted + information @ (self.x - mean)
 
     @property
     def remaining(self) -> float:
         """What is left to go to the minimum [standard deviations], but for lengths at their bound."""
-        free = (self.x > self.problem.lower_bounds + 1e-6) | (self.gradient < 0.0)
+        free = (self.x > self.lower_bounds + 1e-6) | (self.gradient < 0.0)
         gradient = self.gradient[free]
         return float(np.sqrt(gradient @ np.linalg.solve(self.information[np.ix_(free, free)], gradient)))
 
 
-def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, strict: bool = True) -> Estimate:
-    """Return the minimiser by CasADi's `nlpsol`: sequential quadratic programming with the Gauss-Newton Hessian.
+def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> LeastSquares:
+    """Return the least squares at its minimum, by sequential quadratic programming with the Gauss-Newton Hessian.
 
     Parameters
     ----------
-    start : x (m,) to begin with
+    problem : at the x to begin with
     steps : at most
     strict : raise where the steps do not suffice, instead of returning the last x
 
@@ -188,8 +164,8 @@ def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, stric
     NoSolution
         It did not converge.
     """
-    observations, (mean, information), weights = problem
-    start = np.maximum(start, problem.lower_bounds)
+    observations, (mean, information), weights = problem.observations, problem.prior, problem.weights
+    start = np.maximum(problem.x, problem.lower_bounds)
     # In units of the prior's standard deviations the gradient says how far there is to go.
     scale = np.diag(information) ** -0.5
     z = ca.MX.sym("z", len(start))
@@ -218,10 +194,10 @@ def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, stric
     minimiser = np.asarray(solver(x0=0.0, lbx=(problem.lower_bounds - start) / scale)["x"]).ravel()
     if not np.all(np.isfinite(minimiser)):
         minimiser = np.zeros(len(start))
-    estimate = Estimate(problem, np.maximum(start + scale * minimiser, problem.lower_bounds))
-    if strict and not estimate.remaining < LOOSE_TOLERANCE:
+    solution = replace(problem, x=np.maximum(start + scale * minimiser, problem.lower_bounds))
+    if strict and not solution.remaining < LOOSE_TOLERANCE:
         raise NoSolution(
-            f"the lengths did not converge ({estimate.remaining:.2g} standard deviations to go); check that the hands "
+            f"the lengths did not converge ({solution.remaining:.2g} standard deviations to go); check that the hands "
             f"do in the phase what the protocol says, and that every sensor sits where the session says"
         )
-    return estimate
+    return solution

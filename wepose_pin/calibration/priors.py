@@ -45,7 +45,7 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     information[layout.drift, layout.drift] = DRIFT_STD**-2
     for name, foam in zip(layout.soft, layout.foam, strict=True):
         information[foam, foam] = np.maximum(np.tile(table.segments[name].foam_std, 3), LEAST_FOAM_STD) ** -2.0
-    information[layout.twist, layout.twist] = np.array([twist.std for twist in layout.twists]) ** -2.0
+    information[layout.twist, layout.twist] = np.array([std for *_, std in layout.twists]) ** -2.0
     # Axes of hinges; those of a left and a right one are partly alike.
     hinges = {hinge.name: rows for hinge, rows in zip(layout.hinges, layout.hinge, strict=True)}
     for name, (across, tilted) in hinges.items():
@@ -62,7 +62,7 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     for closure, point in zip(fixed, layout.point, strict=True):
         information[point, point] = (POINT_STD if closure.at is None else closure.at_std) ** -2
         mean[point] = closure.at or 0.0
-    return Gaussian(mean, information)
+    return mean, information
 
 
 def _add_shape(mean: np.ndarray, information: np.ndarray, problem: CalibrationProblem, layout: Layout) -> None:

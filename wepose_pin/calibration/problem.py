@@ -32,7 +32,7 @@ from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations
 from .protocols import Closure, Condition, FreeMotion, Protocol
-from .samples import ConnectedSamples, find_connected, find_samples, mask_measured, read_recorded_places
+from .samples import find_connected, find_samples, mask_measured, read_recorded_places
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -206,17 +206,17 @@ class CalibrationProblem:
         return [find_samples(self.recording, self.intervals(condition)) for condition in self.protocol.conditions]
 
     @cached_property
-    def connected(self) -> ConnectedSamples:
-        """The samples at which no sensor has lost its heading since the start pose."""
+    def connected(self) -> tuple[np.ndarray, str, tuple[float, float]]:
+        """The samples at which no sensor has lost its heading since the start pose, as `find_connected`."""
         return find_connected(self.recording, self.filtered.start, self.sensors)
 
     def diagnose_losses(self) -> list[Diagnostic]:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
-        diagnostics, lost = [], self.connected.lost
+        diagnostics, (connected, lost, loss) = [], self.connected
         for condition, phase in zip(self.protocol.conditions, self.phase_samples, strict=True):
-            unused = float(np.sum(~self.connected.include(phase))) / self.recording.rate_hz
+            unused = float(np.sum(~connected[phase])) / self.recording.rate_hz
             if unused:
-                facts = {"phase": _name_phase(condition), "interval": format_span(self.connected.loss)}
+                facts = {"phase": _name_phase(condition), "interval": format_span(loss)}
                 diagnostics.append(Diagnostic("samples-not-connected", WARNING, lost, unused, facts=facts))
         return diagnostics
 
@@ -229,14 +229,12 @@ class CalibrationProblem:
             A condition has too few samples at which all sensors measure, connected with the start pose.
         """
         recording, filtered, layout = self.recording, self.filtered, self._lay_out()
-        count = sum(map(len, self.phase_samples))
-        stride = max(1, round(recording.rate_hz / rate_hz), count // MOST_SAMPLES)
+        (connected, lost, loss), conditions = self.connected, self.protocol.conditions
+        stride = max(1, round(recording.rate_hz / rate_hz), sum(map(len, self.phase_samples)) // MOST_SAMPLES)
         parts, places = [], []
-        for condition, constraint, phase in zip(
-            self.protocol.conditions, self.conditions, self.phase_samples, strict=True
-        ):
+        for condition, constraint, phase in zip(conditions, self.conditions, self.phase_samples, strict=True):
             samples = phase[::stride]
-            samples = samples[mask_measured(recording, recording.sensors, samples) & self.connected.include(samples)]
+            samples = samples[mask_measured(recording, recording.sensors, samples) & connected[samples]]
             place = np.zeros((len(samples), 3))
             if isinstance(constraint, Loop) and constraint.kind == "recorded":
                 place = read_recorded_places(recording, constraint.closure, recording.time[samples])
@@ -246,16 +244,15 @@ class CalibrationProblem:
             places.append(place)
             seconds = len(samples) * stride / recording.rate_hz
             if seconds < LEAST_S:
-                lost = ""
-                if not self.connected.include(phase).all():
-                    lost = (
-                        f"; sensors.{self.connected.lost} is lost from {format_span(self.connected.loss)}, and its "
-                        f"heading with it: name a start pose and a motion with nothing lost between them, or record "
-                        f"again"
+                because = ""
+                if not connected[phase].all():
+                    because = (
+                        f"; sensors.{lost} is lost from {format_span(loss)}, and its heading with it: name a start "
+                        f"pose and a motion with nothing lost between them, or record again"
                     )
                 raise BadPhase(
                     f"{recording.where()}: {_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; "
-                    f"at least {LEAST_S:g} s are needed, better a minute{lost}"
+                    f"at least {LEAST_S:g} s are needed, better a minute{because}"
                 )
         samples = np.concatenate(parts)
         rotations_since_start = [
@@ -264,7 +261,7 @@ class CalibrationProblem:
         recorded = np.concatenate(places).T[: 3 * layout.recorded]
         data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        names = tuple(condition.phase for condition in self.protocol.conditions)
+        names = tuple(condition.phase for condition in conditions)
         return Observations(layout, data, self.conditions, condition_index, names), samples
 
     def _lay_out(self) -> Layout:

@@ -7,7 +7,6 @@ the start pose, is not used.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,23 +27,19 @@ def find_samples(recording: Recording, intervals: Iterable[tuple[float, float]])
     return np.flatnonzero(inside)
 
 
-class ConnectedSamples(NamedTuple):
-    """The samples between the losses around the start pose."""
+def find_connected(
+    recording: Recording, start: tuple[float, float], sensors: Collection[str]
+) -> tuple[np.ndarray, str, tuple[float, float]]:
+    """Find the samples between which and the start pose [s] none of these sensors lost more than `LONGEST_LOSS_S`.
 
-    first: int
-    last: int
-    lost: str  # the sensor whose loss ends them, else the one whose loss they begin with; empty: none was lost
-    loss: tuple[float, float]  # [s] of that loss
-
-    def include(self, samples: np.ndarray) -> np.ndarray:
-        """Return (n,) bool: these samples (n,) are connected with the start pose."""
-        return (samples >= self.first) & (samples <= self.last)
-
-
-def find_connected(recording: Recording, start: tuple[float, float], sensors: Collection[str]) -> ConnectedSamples:
-    """Find the samples between which and the start pose [s] none of these sensors lost more than `LONGEST_LOSS_S`."""
+    Returns
+    -------
+    connected : (n,) bool
+    lost : the sensor whose loss ends them, else the one whose loss they begin with; empty: none was lost
+    loss : [s] of that loss
+    """
     begin = recording.span(start).start
-    first, last, lost, loss = 0, len(recording) - 1, "", (np.nan, np.nan)
+    first, end, lost, loss = 0, len(recording), "", (np.nan, np.nan)
     for name in sensors:
         gap = recording.sensors[name].gap
         if gap is None or isinstance(recording.sensors[name], OrientationSensor):
@@ -53,13 +48,14 @@ def find_connected(recording: Recording, start: tuple[float, float], sensors: Co
             if b - a <= LONGEST_LOSS_S * recording.rate_hz:
                 continue
             span = float(recording.time[a]), float(recording.time[b - 1])
-            if a >= begin and a <= last:
-                last, lost, loss = a - 1, name, span
+            if begin <= a < end:
+                end, lost, loss = a, name, span
             elif a < begin and b > first:
                 first = b
-                if last == len(recording) - 1:
+                if end == len(recording):
                     lost, loss = name, span
-    return ConnectedSamples(first, last, lost, loss)
+    samples = np.arange(len(recording))
+    return (samples >= first) & (samples < end), lost, loss
 
 
 def mask_measured(recording: Recording, sensors: Collection[str], samples: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from .conditions import Loop, is_scale_observed
 from .couplings import add_couplings
 from .equations import GAP_ROWS, HINGE_STD, Layout
 from .initial_headings import search_headings, wrap_angle
-from .least_squares import MIN_LENGTH, Estimate, Gaussian, LeastSquares, solve
+from .least_squares import MIN_LENGTH, Gaussian, LeastSquares, solve
 from .priors import build_prior, place_points
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import FreeMotion
@@ -57,22 +57,23 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
         It did not converge, or a length is at its bound; not where it is quick.
     """
     observations, samples = problem.observe(QUICK_RATE_HZ if quick else SAMPLE_RATE_HZ)
-    layout, prior = observations.layout, build_prior(problem, observations)
+    layout, (prior_mean, information) = observations.layout, build_prior(problem, observations)
     couplings = [] if quick and problem.protocol.closures else problem.couplings
     stated = problem.stated_headings(layout.sensors)
     is_free = np.array([name not in stated for name in layout.sensors])
 
     def prior_at(psi: np.ndarray) -> Gaussian:
         """Return the prior with couplings, and with unknown headings at ψ (sensors,) [rad]."""
-        mean = prior.mean.copy()
+        mean = prior_mean.copy()
         mean[layout.heading] = np.where(is_free, psi, mean[layout.heading])
-        return add_couplings(Gaussian(mean, prior.information), layout, couplings, mean)
+        return add_couplings((mean, information), layout, couplings, mean)
 
-    headings = search_headings(observations, prior.mean, stated, couplings)
-    start = place_points(prior_at(headings[0]).mean, observations)
+    headings = search_headings(observations, prior_mean, stated, couplings)
+    prior = prior_at(headings[0])
+    start = place_points(prior[0], observations)
     # The weight of a gap in the initial guess: near 0 where the palms are apart.
     contact = (1.0 + np.sum(observations.gaps(start) ** 2, axis=1) / WIDE**2) ** -2
-    result = solve_reweighted(observations, prior_at(headings[0]), start, contact, quick)
+    result = solve_reweighted(observations, prior, start, contact, quick)
     if quick:
         return _describe(problem, samples, result, result.fit.covariance)
     lengths = result.fit.x[layout.length]
@@ -101,19 +102,19 @@ def include_other_minima(
     headings : (k, sensors) [rad] of the other minima, the lowest first
     prior_at : headings (sensors,) → what is known without the closure; those without a stated mount are its mean
     """
-    fit, (observations, _, weights) = result.fit, result.fit.problem
-    rows = observations.layout.heading
+    fit = result.fit
+    observations, rows = fit.observations, fit.observations.layout.heading
     if not observations.closed.any():
         return covariance, []
     stride = max(1, len(observations) // COMPARED_SAMPLES)
     few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
-    some, weights = observations.take(few), stride * weights[few]
+    some, weights = observations.take(few), stride * fit.weights[few]
 
-    def solve_from(psi: np.ndarray) -> Estimate:
+    def solve_from(psi: np.ndarray) -> LeastSquares:
         start = fit.x.copy()
         start[rows] += wrap_angle(psi - start[rows])
         start = place_points(start, some)
-        return solve(LeastSquares(some, prior_at(start[rows]), weights), start, COMPARED_STEPS, strict=False)
+        return solve(LeastSquares(some, prior_at(start[rows]), weights, start), COMPARED_STEPS, strict=False)
 
     best, std = solve_from(fit.x[rows]), np.sqrt(np.diag(fit.covariance)[rows])
     # The residuals' variance is estimated from the effective samples: Student's t, not a Gaussian.
@@ -137,8 +138,8 @@ def include_other_minima(
 
 def _describe(problem: CalibrationProblem, samples: np.ndarray, result: WeightedFit, x_cov: np.ndarray) -> Calibration:
     """Return the calibration that a solution at samples (n,) makes, with the covariance (m, m) of x."""
-    fit, observations, prior = result.fit, result.fit.problem.observations, problem.prior
-    layout = observations.layout
+    fit, observations, prior, filtered = result.fit, result.fit.observations, problem.prior, problem.filtered
+    layout, is_closed = observations.layout, observations.closed
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
     scale = "of the population prior" if prior.is_population else f"of {prior.name}"
@@ -146,28 +147,25 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
         scale = f"measured: {', '.join(problem.scale_lengths)}"
     elif is_scale_observed(problem.conditions):
         scale = "of the closure"
-    hinges = _estimate_hinges(problem, fit, x_cov)
-    scatter = estimate_scatter([hinge.std for hinge, _ in hinges.values()])
-    subject = replace(
-        _make_subject(problem, fit, x_cov, scatter),
-        hinges={joint: hinge for joint, (hinge, _) in hinges.items()},
-        note=f"{problem.protocol.title}; scale {scale}",
-    )
+    hinges, hinge_rms = _estimate_hinges(problem, fit, x_cov)
+    scatter = estimate_scatter([hinge.std for hinge in hinges.values()])
+    subject = _make_subject(problem, fit, x_cov, scatter)
+    subject = replace(subject, hinges=hinges, note=f"{problem.protocol.title}; scale {scale}")
     prior_x = fit.x.copy()
     prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
     gap, prior_gap = (
-        np.where(observations.closed, np.linalg.norm(gaps, axis=1), np.nan)
+        np.where(is_closed, np.linalg.norm(gaps, axis=1), np.nan)
         for gaps in (fit.gaps, observations.gaps(place_points(prior_x, observations)))
     )
-    diagnostics = [*problem.filtered.diagnostics, *problem.diagnose_losses()]
+    diagnostics = [*filtered.diagnostics, *problem.diagnose_losses()]
     if not problem.protocol.closures:
         facts = {"protocol": problem.protocol.title, "prior": prior.note or prior.name}
         diagnostics.append(Diagnostic("lengths-not-observed", INFO, facts=facts))
-    for name in problem.filtered.R_VS:
+    for name in filtered.R_VS:
         if name not in subject.mounts:
             facts = {"protocol": problem.protocol.name}
             diagnostics.append(Diagnostic("mount-unknown", WARNING, name, facts=facts))
-    for phase, deviation in result.posed.items() if observations.closed.any() else ():
+    for phase, deviation in result.posed.items() if is_closed.any() else ():
         if deviation > CONTRADICTED:
             diagnostics.append(Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED))
     least_std = 0.0 if problem.model.table.is_mechanism else LEAST_LENGTH_STD
@@ -182,15 +180,15 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
         prior_gap=prior_gap,
         contact=result.contact,
         quat_WL=problem.orient_segments(subject.mounts, samples),
-        measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
-        hinge_rms={joint: rms for joint, (_, rms) in hinges.items()},
+        measured_lengths=compare_measured(fit, problem.measured, least_std),
+        hinge_rms=hinge_rms,
         posed=result.posed,
     )
 
 
-def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray, scatter: float) -> Subject:
+def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray, scatter: float) -> Subject:
     """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`TissueMean`)."""
-    R_VS_start, layout, x = problem.filtered.R_VS_start, fit.problem.observations.layout, fit.x
+    R_VS_start, layout, x = problem.filtered.R_VS_start, fit.observations.layout, fit.x
     std, R_WS_start, offsets, drifts = np.sqrt(np.diag(x_cov)), {}, {}, {}
     headings = dict(zip(layout.sensors, x[layout.heading].tolist(), strict=True))
     # The mounts of sensors outside the chain are those of the start pose.
@@ -218,14 +216,14 @@ def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray,
 
 
 def _estimate_hinges(
-    problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray
-) -> Mapping[str, tuple[Hinge, float]]:
-    """Joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
-    layout, hinges = fit.problem.observations.layout, {}
-    spans = [span for c, span in fit.problem.observations.spans() if isinstance(c, Loop | FreeMotion)]
+    problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray
+) -> tuple[dict[str, Hinge], dict[str, float]]:
+    """Return joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
+    layout, hinges, hinge_rms = fit.observations.layout, {}, {}
+    spans = [span for c, span in fit.observations.spans() if isinstance(c, Loop | FreeMotion)]
     lags = {
-        twist.segment: float(fit.x[row])
-        for twist, row in zip(layout.twists, layout.twist, strict=True)
+        segment: float(fit.x[row])
+        for (segment, *_), row in zip(layout.twists, layout.twist, strict=True)
         if x_cov[row, row] < MOST_LAG_STD**2
     }
     for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
@@ -233,10 +231,10 @@ def _estimate_hinges(
             axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
             axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
             bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
-            rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
+            hinge_rms[term.name] = rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
             std = max(rms, problem.model.table.hinges[term.name].softness)
-            hinges[term.name] = Hinge(axis_L, std, lags.get(term.on)), rms
-    return hinges
+            hinges[term.name] = Hinge(axis_L, std, lags.get(term.on))
+    return hinges, hinge_rms
 
 
 def _project_to_subject(

@@ -8,14 +8,15 @@ lose their weight.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from .conditions import Level, Loop, Pointing
 from .couplings import LEAST_CORRELATION_S
-from .equations import GAP_ROWS, HINGE_STD, Layout
-from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve
+from .equations import GAP_ROWS, HINGE_STD
+from .least_squares import STEPS, Gaussian, LeastSquares, Observations, solve
 from .protocols import FreeMotion
 from .result import MIN_CONTACT, MeasuredLength
 
@@ -37,41 +38,18 @@ POSED_ROUND = 1  # after which poses are used that do not contradict the closure
 # which the residuals show in part.
 LEAST_LENGTH_STD = 0.010
 
+# Residuals of a closure whose weight is measured: their samples and columns, the contact (n,) of these samples, and the
+# least variance.
+Block = tuple[slice, slice, np.ndarray, float]
+
 
 class WeightedFit(NamedTuple):
     """A solution with the weights that its own residuals give."""
 
-    fit: Estimate
+    fit: LeastSquares
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
     effective_sample_size: float  # of the gap
     posed: Mapping[str, float]  # phase of poses → standard deviations from what is known without it
-
-
-class _Block(NamedTuple):
-    """Residuals of a closure whose weight is measured: those of the gap, or those of the hinges."""
-
-    span: slice  # of samples
-    columns: slice  # of residuals
-    contact: np.ndarray  # (n,) of these samples; 1 for hinges
-    least_variance: float
-
-    def measure(self, residuals: np.ndarray, least: float) -> tuple[float, float]:
-        """Return the variance of residuals (n, k), and of how many samples one is independent, at least `least`."""
-        r = residuals[self.span, self.columns]
-        variance = float(self.contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(self.contact.sum()))
-        return max(variance, self.least_variance), count_correlated_samples(r * self.contact[:, None], least)
-
-
-def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool = True) -> list[_Block]:
-    blocks = []
-    for condition, span in observations.spans():
-        if isinstance(condition, Loop):
-            blocks.append(_Block(span, slice(condition.closure.rows), contact[span], LEAST_VARIANCE))
-            if observations.layout.hinges and hinges:
-                # However well an elbow's axis fits this motion: what it leaves a hinge by follows the pose.
-                every = np.ones(span.stop - span.start)
-                blocks.append(_Block(span, slice(GAP_ROWS, None), every, (ELBOW_STD / HINGE_STD) ** 2))
-    return [block for block in blocks if block.contact.sum() > 0.0]
 
 
 def solve_reweighted(
@@ -87,39 +65,61 @@ def solve_reweighted(
     quick : one round with few steps and without hinges
     """
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
-    x, contact, correlation = start, contact.copy(), min_correlation(observations)
+    contact, correlation = contact.copy(), min_correlation(observations)
     stated, poses, posed = _state_weights(observations, contact, correlation), observations.poses(), dict[str, float]()
     if quick:
         stated[:, GAP_ROWS:] = 0.0
     weights, closed = stated.copy(), bool(observations.closed.any())
     for span in [span for own in poses.values() for _, span in own] if closed else ():
         weights[span] = 0.0
+    fit = LeastSquares(observations, prior, weights, start)
     for k in range(rounds if closed else 0):
-        fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
-        x, weights = fit.x, weights.copy()
-        for closure, span in observations.spans():
-            if isinstance(closure, Loop):
-                rows = closure.closure.rows
-                r, least = fit.closure[span, :rows], MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
+        fit = solve(fit, steps if k == 0 else ROUND_STEPS, strict=False)
+        weights, least = fit.weights.copy(), MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
+        for loop, span in observations.spans():
+            if isinstance(loop, Loop):
                 # The lower third: the palms may be apart for half of the phase and more.
-                size = np.sum(r**2, axis=1)
+                rows = loop.closure.rows
+                size = np.sum(fit.residuals[span, :rows] ** 2, axis=1)
                 usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[rows], LEAST_VARIANCE)
                 weight = (1.0 + size / (usual * OUTLIER**2 * rows)) ** -2
                 contact[span] = np.where(weight > least, weight, 0.0)
         for block in _list_blocks(observations, contact, hinges=not quick):
-            variance, correlated = block.measure(fit.residuals, correlation)
-            weights[block.span, block.columns] = block.contact[:, None] / (correlated * variance)
+            span, columns, touch, _ = block
+            variance, correlated = _measure_block(fit, block, correlation)
+            weights[span, columns] = touch[:, None] / (correlated * variance)
         if k == min(POSED_ROUND, rounds - 1):
             posed = {phase: _measure_pose(fit, own, stated, used=False) for phase, own in poses.items()}
-            used = [span for phase, own in poses.items() if posed[phase] <= CONTRADICTED for _, span in own]
-            for span in used:
+            for span in [span for phase, own in poses.items() if posed[phase] <= CONTRADICTED for _, span in own]:
                 weights[span] = stated[span]
-    fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
-    gaps = _list_blocks(observations, contact, hinges=False)
-    counts = [float(block.contact.sum()) / block.measure(fit.residuals, correlation)[1] for block in gaps]
+        fit = replace(fit, weights=weights)
+    fit = solve(fit, steps if quick else FINAL_STEPS, strict=not quick)
+    effective_sample_size = 0.0
+    for block in _list_blocks(observations, contact, hinges=False):
+        effective_sample_size += float(block[2].sum()) / _measure_block(fit, block, correlation)[1]
     if not closed and not quick:
         posed = {phase: _measure_pose(fit, own, stated, used=True) for phase, own in poses.items()}
-    return WeightedFit(fit, contact, sum(counts), posed)
+    return WeightedFit(fit, contact, effective_sample_size, posed)
+
+
+def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool = True) -> list[Block]:
+    blocks: list[Block] = []
+    for condition, span in observations.spans():
+        if isinstance(condition, Loop):
+            blocks.append((span, slice(condition.closure.rows), contact[span], LEAST_VARIANCE))
+            if observations.layout.hinges and hinges:
+                # However well an elbow's axis fits this motion: what it leaves a hinge by follows the pose.
+                every = np.ones(span.stop - span.start)
+                blocks.append((span, slice(GAP_ROWS, None), every, (ELBOW_STD / HINGE_STD) ** 2))
+    return [block for block in blocks if block[2].sum() > 0.0]
+
+
+def _measure_block(fit: LeastSquares, block: Block, least: float) -> tuple[float, float]:
+    """Return the variance of a block's residuals, and of how many samples one is independent, at least `least`."""
+    span, columns, contact, least_variance = block
+    r = fit.residuals[span, columns]
+    variance = float(contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(contact.sum()))
+    return max(variance, least_variance), count_correlated_samples(r * contact[:, None], least)
 
 
 def _state_weights(observations: Observations, contact: np.ndarray, correlation: float) -> np.ndarray:
@@ -162,19 +162,19 @@ def estimate_covariance(result: WeightedFit) -> np.ndarray:
     sample and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
-    fit, (observations, prior, weights) = result.fit, result.fit.problem
-    J, C, least = fit.jacobian, fit.covariance, min_correlation(observations)
-    gradient = prior.information.copy()
+    fit = result.fit
+    observations, weights, J, C = fit.observations, fit.weights, fit.jacobian, fit.covariance
+    gradient, least = fit.prior[1].copy(), min_correlation(observations)
     for condition, span in observations.spans():
         if not isinstance(condition, Loop):
             gradient += np.einsum("nk,nki,nkj->ij", weights[span], J[span], J[span], optimize=True)
     for block in _list_blocks(observations, result.contact):
-        slope = J[block.span, block.columns]
-        variance, duration = block.measure(fit.residuals, least)
+        span, columns, contact, _ = block
+        slope, (variance, duration) = J[span, columns], _measure_block(fit, block, least)
         # The fit has reduced the residuals: their variance gets back what it took.
         taken = np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
-        variance += float(block.contact @ taken) / (slope.shape[1] * float(block.contact.sum()))
-        pull, length = weights[block.span, block.columns, None] * slope, round(duration)
+        variance += float(contact @ taken) / (slope.shape[1] * float(contact.sum()))
+        pull, length = weights[span, columns, None] * slope, round(duration)
         summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
         ends = np.arange(1, len(pull) + length)
         windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - length, 0)]
@@ -184,7 +184,7 @@ def estimate_covariance(result: WeightedFit) -> np.ndarray:
 
 
 def compare_measured(
-    fit: Estimate, layout: Layout, measured: Mapping[str, tuple[float, float]], least_std: float
+    fit: LeastSquares, measured: Mapping[str, tuple[float, float]], least_std: float
 ) -> dict[str, MeasuredLength]:
     """Each measured length, name → ([m], its standard deviation [m]), beside the solution without it.
 
@@ -192,7 +192,7 @@ def compare_measured(
     """
     compared = {}
     for name, (metres, std) in measured.items():
-        row = layout.lengths.index(name)
+        row = fit.observations.layout.lengths.index(name)
         variance = fit.covariance[row, row]
         rest = 1.0 / variance - 1.0 / std**2  # information without that of the measured length
         expected = metres + (fit.x[row] - metres) / (variance * rest)
@@ -201,21 +201,17 @@ def compare_measured(
 
 
 def _measure_pose(
-    fit: Estimate, poses: Sequence[tuple[Pointing | Level, slice]], stated: np.ndarray, used: bool
+    fit: LeastSquares, poses: Sequence[tuple[Pointing | Level, slice]], stated: np.ndarray, used: bool
 ) -> float:
     """By how many standard deviations a phase of poses deviates from what is known without it.
 
-    A pose has no residual that would show how it was held, as a closure has: only the other conditions can.
-
-    Parameters
-    ----------
-    stated : (n, k) weights of the residuals where the poses are used
-    used : whether the fit uses these poses
+    A pose has no residual that would show how it was held, as a closure has: only the other conditions can. `stated`
+    (n, k) are the weights of the residuals where the poses are used, and `used` says whether the fit uses them.
     """
     r, H, degrees = [], [], 0
     for condition, span in poses:
         whiten = np.sqrt(stated[span, :GAP_ROWS].sum(axis=0))
-        r.append(whiten * fit.closure[span].mean(axis=0))
+        r.append(whiten * fit.residuals[span, :GAP_ROWS].mean(axis=0))
         H.append(whiten[:, None] * fit.jacobian[span, :GAP_ROWS].mean(axis=0))
         degrees += 2 if isinstance(condition, Pointing) else 1
     z, slope = np.concatenate(r), np.concatenate(H)

@@ -62,25 +62,29 @@ class GirdleTerm(NamedTuple):
         return rotate(quat_WL[law.on], R_on @ own)
 
 
-class BodySymbols(NamedTuple):
-    """A body in CasADi."""
+def express_path(
+    path: PointPath,
+    quat_WL: Mapping[str, ca.SX],
+    lengths: ca.SX,
+    girdles: Mapping[str, tuple[GirdleTerm, ca.SX]],
+) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """Return a path (3,) [m] in W, and its vectors, segment → (3,) [m], without the girdles.
 
-    quat_WL: Mapping[str, ca.SX]  # segment → (4,) xyzw of L'
-    lengths: ca.SX  # (k,) [m], in the order of the table
-    girdles: Mapping[str, tuple[GirdleTerm, ca.SX]]  # name → the girdle and a person's parameters (7,)
-
-
-def express_path(path: PointPath, body: BodySymbols) -> tuple[ca.SX, dict[str, ca.SX]]:
-    """Return a path (3,) [m] in W, and its vectors, segment → (3,) [m], without the girdles."""
+    Parameters
+    ----------
+    quat_WL : segment → (4,) xyzw of L'
+    lengths : (k,) [m], in the order of the table
+    girdles : name → the girdle and a person's parameters (7,)
+    """
     whole, vectors = ca.SX.zeros(3), {}
     for name, sign in path.girdles:
-        if name in body.girdles:
-            term, parameters = body.girdles[name]
-            whole += sign * term.displacement(body.quat_WL, parameters)
+        if name in girdles:
+            term, parameters = girdles[name]
+            whole += sign * term.displacement(quat_WL, parameters)
     for part in path.vectors:
-        vector = ca.sparsify(ca.DM(np.array(part.by_length))) @ body.lengths + ca.DM(part.constant)
+        vector = ca.sparsify(ca.DM(np.array(part.by_length))) @ lengths + ca.DM(part.constant)
         if part.segment != UNIVERSE:
-            vectors[part.segment] = vector = rotate(body.quat_WL[part.segment], vector)
+            vectors[part.segment] = vector = rotate(quat_WL[part.segment], vector)
         whole += vector
     return whole, vectors
 
@@ -178,21 +182,18 @@ class PointPair:
         self.points = points
         between = find_path(model, start, sensors, [(points[0], 1.0), (points[1], -1.0)])
         self.segments = tuple(part.segment for part in between.vectors if part.segment != UNIVERSE)
-        table, k, lengths = model.table, len(sensors), len(model.lengths)
+        table, k, n = model.table, len(sensors), len(model.lengths)
         self._shape = np.concatenate([list(model.lengths.values()), *map(model.girdle_parameters, table.girdles)])
         quat, headings, shape = ca.SX.sym("quat", 4 * k), ca.SX.sym("headings", k), ca.SX.sym("shape", len(self._shape))
-        parameters = dict(zip(table.girdles, ca.vertsplit(shape[lengths:], len(PARAMETERS)), strict=True))
-        body = BodySymbols(
-            {name: product(about_z(headings[i]), quat[4 * i : 4 * i + 4]) for i, name in enumerate(sensors)},
-            shape[:lengths],
-            {term.name: (term, parameters[term.name]) for term in find_girdles(model, start, sensors)},
-        )
-        gap, vectors = express_path(between, body)
+        parameters = dict(zip(table.girdles, ca.vertsplit(shape[n:], len(PARAMETERS)), strict=True))
+        quat_WL = {name: product(about_z(headings[i]), quat[4 * i : 4 * i + 4]) for i, name in enumerate(sensors)}
+        girdles = {term.name: (term, parameters[term.name]) for term in find_girdles(model, start, sensors)}
+        gap, vectors = express_path(between, quat_WL, shape[:n], girdles)
         off_law = ca.SX.zeros(3, 3)
         for name, _ in between.girdles:
             girdle = table.girdles[name]
             for axis, std in zip(start.rotation(girdle.on).T, girdle.residual_std, strict=True):
-                off = std * rotate(body.quat_WL[girdle.on], ca.DM(axis))
+                off = std * rotate(quat_WL[girdle.on], ca.DM(axis))
                 off_law += off @ off.T
         by_attitude = express_covariance(vectors, 0.0, dict.fromkeys(vectors, 1.0))
         rows = [gap, ca.jacobian(gap, headings), ca.jacobian(gap, shape), by_attitude, off_law]
