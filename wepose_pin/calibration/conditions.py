@@ -13,7 +13,7 @@ from ..body.lengths import UNIVERSE
 from ..body.mounts import StartPose
 from ..body.table import Vector
 from ..errors import BadSession
-from ..observations.paths import ZERO_LENGTH, PointPath, SegmentVector, find_path
+from ..observations.paths import PointPath, SegmentVector, find_path
 from ..observations.symbols import rotate, rotate_back
 from ..recording import Recording
 from .protocols import Closure, Direction, FreeMotion, Protocol
@@ -73,13 +73,7 @@ Constraint = Loop | Pointing | Level | FreeMotion  # while limbs move freely onl
 def resolve_conditions(
     protocol: Protocol, model: BodyModel, start: StartPose, recording: Recording
 ) -> tuple[Constraint, ...]:
-    """The protocol's conditions on this body with the recording's sensors.
-
-    Raises
-    ------
-    BadSession
-        A closure between points that no sensor determines, or a pose of a segment without a sensor.
-    """
+    """The protocol's conditions on this body with the recording's sensors; raise as `CalibrationProblem.conditions`."""
     table, sensors, constraints = model.table, recording.sensors, list[Constraint]()
     where = f"{recording.where()}: protocol '{protocol.name}': "
     for condition in protocol.conditions:
@@ -110,19 +104,8 @@ def resolve_conditions(
 
 def is_scale_observed(constraints: Collection[Constraint]) -> bool:
     """Whether the closures determine the scale: by a recorded or known place, or by a link of known size."""
-    loops = [constraint for constraint in constraints if isinstance(constraint, Loop)]
     return any(
         loop.kind == "recorded" or loop.closure.at is not None or any(np.any(part.constant) for part in loop.parts)
-        for loop in loops
+        for loop in constraints
+        if isinstance(loop, Loop)
     )
-
-
-def group_lengths(constraints: Collection[Constraint], lengths: Collection[str]) -> dict[str, tuple[str, ...]]:
-    """Sensor → the lengths that rotate with it in some closure, which observes the sum of those in one direction."""
-    groups: dict[str, dict[str, None]] = {}
-    for loop in constraints:
-        for part in loop.parts if isinstance(loop, Loop) else ():
-            moved = np.abs(np.array(part.by_length)).max(axis=0) > ZERO_LENGTH
-            names = [name for name, moves in zip(lengths, moved, strict=True) if moves]
-            groups.setdefault(part.segment, {}).update(dict.fromkeys(names))
-    return {sensor: tuple(names) for sensor, names in groups.items() if names}

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
-from .conditions import Loop, group_lengths
+from .conditions import Loop
 from .least_squares import MIN_LENGTH
 from .problem import CalibrationProblem
 from .protocols import Closure
@@ -124,7 +124,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "
             f"such as clasp; not '{protocol.name}'"
         )
-    groups = group_lengths(problem.conditions, problem.model.lengths).values()
+    groups = problem.length_groups.values()
     if not any(set(group) <= set(problem.measured) for group in groups):
         names = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
@@ -135,7 +135,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
 
 def _state_constraints(problem: CalibrationProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return E (m, k), d (m,) and its covariance (m, m): measured lengths, and what only the population tells."""
-    groups = group_lengths(problem.conditions, problem.model.lengths).values()
+    groups = problem.length_groups.values()
     names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
     unit, assumed = dict(zip(names, np.eye(len(names)), strict=True)), list[np.ndarray]()
     for group in groups:  # proportions

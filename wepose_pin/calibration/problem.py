@@ -25,9 +25,9 @@ from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
 from ..observations.hinges import find_hinges
 from ..observations.joint_accelerations import find_neighbours
-from ..observations.paths import find_girdles
+from ..observations.paths import ZERO_LENGTH, find_girdles
 from ..recording import Intervals, Recording, format_span
-from .conditions import Constraint, Loop, Pointing, group_lengths, resolve_conditions
+from .conditions import Constraint, Loop, Pointing, resolve_conditions
 from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations
@@ -68,41 +68,31 @@ class CalibrationProblem:
         Raises
         ------
         BadSession
-            A closure between points that no sensor determines.
+            A closure between points that no sensor determines, or a pose of a segment without a sensor.
         """
         return resolve_conditions(self.protocol, self.model, self.start_pose, self.recording)
 
     @cached_property
+    def length_groups(self) -> dict[str, tuple[str, ...]]:
+        """Sensor → the lengths that rotate with it in some closure, which observes sums of those in one direction."""
+        groups: dict[str, dict[str, None]] = {}
+        for part in [part for loop in self.conditions if isinstance(loop, Loop) for part in loop.parts]:
+            moved = np.abs(np.array(part.by_length)).max(axis=0) > ZERO_LENGTH
+            names = [name for name, moves in zip(self.model.lengths, moved, strict=True) if moves]
+            groups.setdefault(part.segment, {}).update(dict.fromkeys(names))
+        return {sensor: tuple(names) for sensor, names in groups.items() if names}
+
+    @cached_property
     def lengths_in_closures(self) -> tuple[str, ...]:
         """The names of the lengths that some closure contains."""
-        groups = group_lengths(self.conditions, self.model.lengths).values()
-        return tuple(name for name in self.model.lengths if any(name in group for group in groups))
+        inside = {name for group in self.length_groups.values() for name in group}
+        return tuple(name for name in self.model.lengths if name in inside)
 
     @property
     def scale_lengths(self) -> tuple[str, ...]:
         """The measured lengths that fix the scale; empty: the prior does."""
         # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
         return tuple(name for name in self.measured if name in (self.lengths_in_closures or self.model.lengths))
-
-    @cached_property
-    def couplings(self) -> list[Coupling]:
-        """The relative headings of neighbours by the acceleration of the joint between them."""
-        moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
-        spans = [span for condition in moving for span in self.intervals(condition)]
-        return estimate_couplings(self.recording, self.filtered, find_neighbours(self.model, self.sensors), spans)
-
-    def intervals(self, condition: Condition) -> Intervals:
-        """Return the intervals [s] in which a condition holds.
-
-        Raises
-        ------
-        BadPhase
-            The recording lacks the phase.
-        """
-        if condition.phase:
-            return self.recording.phase(condition.phase)
-        begin = self.filtered.start[1]
-        return ((begin, min(begin + FREE_S, float(self.recording.time[-1]))),)
 
     @property
     def measured_example(self) -> str:
@@ -127,14 +117,26 @@ class CalibrationProblem:
                 used |= {condition.segment, condition.reference if isinstance(condition, Pointing) else ""}
         return tuple(name for name in self.model.table.segments if name in used)
 
+    @cached_property
+    def couplings(self) -> list[Coupling]:
+        """The relative headings of neighbours by the acceleration of the joint between them."""
+        moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
+        spans = [span for condition in moving for span in self.intervals(condition)]
+        return estimate_couplings(self.recording, self.filtered, find_neighbours(self.model, self.sensors), spans)
+
+    def intervals(self, condition: Condition) -> Intervals:
+        """Return the intervals [s] in which a condition holds; raise `BadPhase` where the recording lacks its phase."""
+        if condition.phase:
+            return self.recording.phase(condition.phase)
+        begin = self.filtered.start[1]
+        return ((begin, min(begin + FREE_S, float(self.recording.time[-1]))),)
+
+    # Mounts and labels ------------------------------------------------------------------------------------------------
+
     def mount(self, segment: str) -> Rotation | None:
         """Return the mount of prior or session, with an L that equals W in the start pose; None: unknown."""
         mount = find_nominal_mount(self.recording, segment, self.prior, self.start_pose)
         return None if mount is None else self.start_pose.to_world(segment, Rotation.from_quat(mount))
-
-    def start_rotation(self, segment: str) -> Rotation:
-        """Return R_WL of a segment in the start pose; L is the segment's frame."""
-        return Rotation.from_matrix(self.start_pose.rotation(segment))
 
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
         """Return segment → ψ [rad] by its mount, of those of these segments whose mount is known."""
@@ -151,14 +153,11 @@ class CalibrationProblem:
         return replace(self, recording=recording, prior=prior)
 
     def leave_out_mounts(self, estimated: Mapping[str, np.ndarray] | None = None) -> CalibrationProblem:
-        """Return the same problem without the mounts that gravity contradicts in the start pose, which it states.
+        """Return the same problem without the mounts that gravity contradicts in the start pose.
 
-        Parameters
-        ----------
-        estimated : segment → `quat_LS` by the motion, which contradicts them instead
+        `estimated` : segment → `quat_LS` by the motion, which contradicts them instead
         """
-        limit = float(np.deg2rad(MAX_MOUNT_ERROR_DEG if estimated is None else MOUNT_WARNING_DEG))
-        unused = []
+        limit, unused = float(np.deg2rad(MAX_MOUNT_ERROR_DEG if estimated is None else MOUNT_WARNING_DEG)), []
         for name in self.recording.imus:
             mount = self.mount(name)
             if mount is None or (estimated is not None and name not in estimated):
@@ -167,20 +166,17 @@ class CalibrationProblem:
                 up_V = (self.filtered.R_VS_start[name] * mount.inv()).apply([0.0, 0.0, 1.0])
                 angle = float(np.arccos(np.clip(up_V[2], -1.0, 1.0)))
             else:
-                R_estimated = self.start_rotation(name) * Rotation.from_quat(estimated[name])
+                R_estimated = self.start_pose.to_world(name, Rotation.from_quat(estimated[name]))
                 angle = float((R_estimated * mount.inv()).magnitude())
             if angle > limit:
-                facts = {"variant": "unused"}
-                unused.append(Diagnostic("mount-contradicted", WARNING, name, angle, limit, facts))
+                unused.append(Diagnostic("mount-contradicted", WARNING, name, angle, limit, {"variant": "unused"}))
         problem = self.remove_mounts([each.place for each in unused])
         return replace(problem, unused_mounts=(*self.unused_mounts, *unused))
 
     def relabel(self, moved: Mapping[str, str]) -> CalibrationProblem:
         """Return the same problem with sensors exchanged between segments; a stated mount goes with its sensor.
 
-        Parameters
-        ----------
-        moved : segment → label of the sensor on it, where they differ
+        `moved` : segment → label of the sensor on it, where they differ
         """
 
         def exchange(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -194,11 +190,17 @@ class CalibrationProblem:
         """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""
         filtered, quat_WL = self.filtered, {}
         for name in (name for name in filtered.R_VS if name in mounts):
-            R_start = self.start_rotation(name)
-            R_WS_start = R_start * Rotation.from_quat(mounts[name])
+            R_WS_start = self.start_pose.to_world(name, Rotation.from_quat(mounts[name]))
             R_WV = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_WS_start)])
-            quat_WL[name] = (R_WV * filtered.R_VS[name][samples] * R_WS_start.inv() * R_start).as_quat()
+            R_WL = R_WV * filtered.R_VS[name][samples] * R_WS_start.inv() * self.start_rotation(name)
+            quat_WL[name] = R_WL.as_quat()
         return quat_WL
+
+    def start_rotation(self, segment: str) -> Rotation:
+        """Return R_WL of a segment in the start pose; L is the segment's frame."""
+        return Rotation.from_matrix(self.start_pose.rotation(segment))
+
+    # Samples ----------------------------------------------------------------------------------------------------------
 
     @cached_property
     def phase_samples(self) -> list[np.ndarray]:

@@ -18,7 +18,7 @@ from ..body.table import ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences
 from ..recording import format_span
 from .alternatives import LEAST_ROTATION, measure_doubt, measure_rotations
-from .conditions import group_lengths, is_scale_observed
+from .conditions import is_scale_observed
 from .result import MIN_CONTACT, Calibration, CalibrationQuality, Check, QualityLimits
 from .weights import CONTRADICTED
 
@@ -81,8 +81,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     failing = [check for check in checks if check.quality != "pass"]
     failing.sort(key=lambda check: (check.quality != "fail", -check.excess))
     by_text: dict[tuple[str, str, float | str], Diagnostic] = {}
-    for check in failing:
-        each = check.cause or check.diagnostic
+    for each in [check.cause or check.diagnostic for check in failing]:
         by_text.setdefault((each.code, each.place, each.facts.get("variant", "")), each)
     reasons = tuple(by_text.values())
     shown = drop_consequences((*reasons, *calibration.remarks))
@@ -125,14 +124,12 @@ def _check_lengths(calibration: Calibration, rotations: Mapping[str, float]) -> 
     lengths, shape = np.array([subject.lengths[name] for name in names]), subject.lengths_covariance(names)
     if len(names) > 1 and not scale_observed:  # errors of the scale change all lengths together
         shape = shape - np.outer(lengths, lengths) / float(lengths @ np.linalg.solve(shape, lengths))
-    for sensor, group in group_lengths(problem.conditions, problem.model.lengths).items():
-        summed = [name for name in group if name in names]
-        if summed:
+    for sensor, group in problem.length_groups.items():
+        if summed := [name for name in group if name in names]:
             take = np.isin(names, summed).astype(float)
             std = float(np.sqrt(max(take @ shape @ take, 0.0)))
-            uncertain = Diagnostic("length-uncertain", INFO, " + ".join(summed), std)
             cause = _find_cause(calibration, rotations, table.segments[sensor].spine)
-            checks.append(_check(uncertain, LENGTH, cause))
+            checks.append(_check(Diagnostic("length-uncertain", INFO, " + ".join(summed), std), LENGTH, cause))
     if not scale_observed:
         facts: dict[str, float | str] = {"measured": problem.measured_example}
         checks.append(_check(Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts), SCALE))
@@ -167,7 +164,7 @@ def _check_headings(calibration: Calibration, rotations: Mapping[str, float]) ->
 
 def _check_residuals(calibration: Calibration) -> list[Check]:
     """Checks of the closure and of the start pose."""
-    checks, tilts = list[Check](), calibration.subject.start_pose_offset
+    checks = list[Check]()
     if calibration.problem.protocol.closures:
         share = float(np.mean(calibration.contact[calibration.closed] < MIN_CONTACT))
         facts = {"intervals": format_longest(calibration.open_intervals)}
@@ -176,21 +173,21 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
             _check(Diagnostic("motion-too-small", INFO, value=calibration.effective_sample_size), SAMPLES),
             _check(Diagnostic("closure-open", INFO, value=share, facts=facts), OPEN_SHARE),
         ]
+    tilts = {name: float(np.linalg.norm(own.tilt)) for name, own in calibration.subject.start_pose_offset.items()}
     if tilts:
-        name = max(tilts, key=lambda n: float(np.linalg.norm(tilts[n].tilt)))
-        checks.append(_check(Diagnostic("start-pose-off", INFO, name, float(np.linalg.norm(tilts[name].tilt))), TILT))
+        name = max(tilts, key=tilts.__getitem__)
+        checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
     return checks
 
 
 def _find_cause(calibration: Calibration, rotations: Mapping[str, float], spine: bool) -> Diagnostic | None:
     """The cause of an uncertainty: too small a motion of the torso or of the limbs, or too short a motion."""
-    table = calibration.problem.model.table
     if not rotations:
         return None
-    in_closures = group_lengths(calibration.problem.conditions, calibration.problem.model.lengths)
-    limbs = [name for name in in_closures if not table.segments[name].spine]
-    own = [rotations[name] for name in ([table.reference] if spine else limbs) if name in rotations]
+    table = calibration.problem.model.table
+    limbs = [name for name in calibration.problem.length_groups if not table.segments[name].spine]
     variant, enough = ("spine", ENOUGH_SPINE) if spine else ("limbs", ENOUGH_LIMBS)
+    own = [rotations[name] for name in ([table.reference] if spine else limbs) if name in rotations]
     if own and min(own) < enough and not table.is_mechanism:
         return Diagnostic("motion-too-small", WARNING, "", min(own), float(enough), {"variant": variant})
     if calibration.effective_sample_size < ENOUGH_SAMPLES:
