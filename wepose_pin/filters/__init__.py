@@ -15,21 +15,19 @@ from ..diagnostics import WARNING, Diagnostic, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
 from ..recording.faults import find_faults, find_gyro_range
-from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE, STANDARD_GRAVITY
+from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 from .amekf import Amekf, AmekfParams
-from .base import FilterRun, OrientationFilter
+from .base import Orientation, OrientationFilter, join_orientations
 from .complementary import Gdc, GdcParams, Ncf, NcfParams
-from .noise import SensorNoise, estimate_noise
+from .noise import TYPICAL, SensorNoise, estimate_noise
 from .published import PublishedSmekf
 from .sensors import (
     BEST,
     METHODS,
     OFFLINE,
     STATIC_ONLY,
-    Orientation,
     SensorFilters,
     check_method,
-    join_orientations,
     run_filter,
 )
 from .smekf import Smekf, SmekfParams
@@ -44,7 +42,6 @@ __all__ = [
     "TYPICAL",
     "Amekf",
     "AmekfParams",
-    "FilterRun",
     "Gdc",
     "GdcParams",
     "Ncf",
@@ -61,17 +58,6 @@ __all__ = [
     "join_orientations",
     "run_filter",
 ]
-
-# For a sensor without a static phase: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
-# factory. Only amekf and smoother estimate the bias in motion.
-TYPICAL = SensorNoise(
-    gyro_bias=np.zeros(3),
-    gyro_bias_cov=np.deg2rad(0.5) ** 2 * np.eye(3),
-    gyro_cov=np.deg2rad(0.1) ** 2 * np.eye(3),
-    accel_cov=0.003**2 * np.eye(3),
-    bias_step_cov=2.0 * np.deg2rad(0.1) ** 2 * np.eye(3),
-    gravity=STANDARD_GRAVITY,
-)
 
 
 def estimate_orientation(

@@ -37,7 +37,7 @@ from .base import (
     RATE_VAR,
     START_HEADING_STD,
     STATIC_TURN_NOISE,
-    FilterRun,
+    Orientation,
     OrientationFilter,
     bridge_rate,
     into_sensor,
@@ -402,7 +402,7 @@ class Amekf(OrientationFilter):
             gyro_bias=noise.gyro_bias,  # [rad/s] as returned: with the motion bias where the sample is not static
             x=x,  # (25,) as `ErrorStates`; the attitude's error is always zero
             P=P,  # (25, 32)
-            about_vertical=np.array([0.0, 0.0, bias_var + p.motion_bias_std**2]),  # as `FilterRun`
+            about_vertical=np.array([0.0, 0.0, bias_var + p.motion_bias_std**2]),  # as `Orientation`
             last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
             lost_s=0.0,  # [s] the same
             # sums over the samples of the open block
@@ -426,8 +426,9 @@ class Amekf(OrientationFilter):
         )
         return state, _build_model(noise, rate_hz, max(1, round(p.block_s * rate_hz)), p)
 
-    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray, out: FilterRun) -> Callable[[], None]:
-        return partial(_run, self.state, self.model, gyro_S, accel_S, static, self.blocks, *out)
+    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
+        arrays = out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical
+        return partial(_run, self.state, self.model, gyro_S, accel_S, out.static, self.blocks, *arrays)
 
 
 def _build_model(noise: SensorNoise, rate_hz: float, block_samples: int, p: AmekfParams) -> np.ndarray:

@@ -1,10 +1,10 @@
-"""What the orientation filters share: their protocol, their results, samples that were lost, runs in threads."""
+"""What the orientation filters share: their protocol, their result, samples that were lost, runs in threads."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any, NamedTuple, TypeVar
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from ..compilation import inlined
+from ..diagnostics import Diagnostic, notebook_html
 from ..errors import BadData
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from .noise import SensorNoise
@@ -29,36 +30,74 @@ HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 MOST_LOST_STD = 4.0  # [rad] beyond which nothing is known
 
-# Columns of `FilterRun.about_vertical`
+# Columns of `Orientation.about_vertical`
 HEADING, RATE, RATE_VAR = range(3)
 
 
-class FilterRun(NamedTuple):
-    """Results of a run, one row a sample; V is the sensor's own world, as in `OrientationFilter`.
+class Orientation(NamedTuple):
+    """Orientation of one sensor over time.
 
-    `about_vertical` has what the filter does about the vertical, where headings are corrected from outside: [rad] the
-    sum of the corrections of its heading since the start, [rad/s] the sum of those of the gyroscope's bias, each at the
-    attitude that the sensor had then, and [rad²/s²] the variance of the bias now.
+    V is the sensor's own world: z up, zero heading at the first sample of the phase from which the filter starts.
+
+    Parameters
+    ----------
+    quat_VS : (n, 4) xyzw, after the sample
+    gyro_bias : (n, 3) [rad/s]
+    static : (n,) bool, the sensor did not move
+    attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_VS`; None where the filter
+        has none
+    noise : of gyroscope and accelerometer in the static phase
+    diagnostics : what the user should know
+    about_vertical : (n, 3) what the filter does about the vertical, where headings are corrected from outside: [rad]
+        the sum of the corrections of its heading since the start, [rad/s] the sum of those of the gyroscope's bias,
+        each at the attitude that the sensor had then, and [rad²/s²] the variance of the bias now; None where the
+        filter has no covariance
     """
 
-    quat_VS: np.ndarray  # (n, 4) xyzw, orientation after the sample
-    gyro_bias: np.ndarray  # (n, 3) [rad/s]
-    attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
-    about_vertical: np.ndarray | None  # (n, 3); None: the filter has no covariance
+    quat_VS: np.ndarray
+    gyro_bias: np.ndarray
+    static: np.ndarray
+    attitude_cov: np.ndarray | None
+    noise: SensorNoise
+    diagnostics: tuple[Diagnostic, ...] = ()
+    about_vertical: np.ndarray | None = None
 
-    def part(self, rows: slice | np.ndarray) -> FilterRun:
-        """Return the samples `rows`, of a slice as views."""
-        return FilterRun(*(None if values is None else values[rows] for values in self))  # type: ignore[arg-type]
+    def take(self, rows: slice | np.ndarray) -> Orientation:
+        """Take the samples `rows`, of a slice as views."""
+        return self._replace(**{name: values[rows] for name, values in self.sampled().items()})
+
+    def sampled(self) -> dict[str, Any]:
+        """Name → values of each sample, of those that the filter has."""
+        named = {name: getattr(self, name) for name in _SAMPLED}
+        return {name: values for name, values in named.items() if values is not None}
+
+    def __repr__(self) -> str:
+        bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
+        share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
+        return f"Orientation({len(self.quat_VS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self, self.diagnostics)
 
 
-def make_run(n: int, *, covariance: bool = True) -> FilterRun:
+_SAMPLED = ("quat_VS", "gyro_bias", "static", "attitude_cov", "about_vertical")
+
+
+def join_orientations(parts: Sequence[Orientation]) -> Orientation:
+    """Join the samples of one sensor's orientations; what is not of each sample is that of the last part."""
+    sampled = [part.sampled() for part in parts]
+    joined: dict[str, Any] = {name: np.concatenate([part[name] for part in sampled]) for name in sampled[0]}
+    return parts[-1]._replace(**joined)
+
+
+def make_orientation(n: int, noise: SensorNoise, *, covariance: bool) -> Orientation:
     """Return arrays for n samples, to be filled."""
-    # One piece of memory for all takes half the time of four.
-    shapes = [(n, 4), (n, 3), *([(n, 3, 3), (n, 3)] if covariance else [])]
-    ends = np.cumsum([0, *map(math.prod, shapes)])
-    memory = np.empty(ends[-1])
-    arrays = [memory[ends[k] : ends[k + 1]].reshape(shape) for k, shape in enumerate(shapes)]
-    return FilterRun(*arrays, *([] if covariance else [None, None]))
+    shapes = [(4,), (3,), *([(3, 3), (3,)] if covariance else [])]
+    ends = n * np.cumsum([0, *map(math.prod, shapes)])
+    memory = np.empty(ends[-1])  # one piece for all takes half the time of four
+    quat, bias, *rest = (memory[ends[k] : ends[k + 1]].reshape(n, *shape) for k, shape in enumerate(shapes))
+    cov, vertical = rest or (None, None)
+    return Orientation(quat, bias, np.empty(n, np.bool_), cov, noise, (), vertical)
 
 
 def make_record(**values: Any) -> np.ndarray:
@@ -95,7 +134,9 @@ class OrientationFilter:
 
     params_type: type | None = None
     has_covariance = True
-    _run: Callable[..., None]  # compiled: state, model, gyro_S, accel_S, static, and the arrays of a `FilterRun`
+    # compiled: state, model, gyro_S, accel_S, static, and the arrays quat_VS, gyro_bias and with a covariance
+    # attitude_cov, about_vertical of an `Orientation`, to be filled
+    _run: Callable[..., None]
 
     def __init__(self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: Any = None) -> None:
         self.params = self.params_type() if params is None and self.params_type else params
@@ -105,36 +146,32 @@ class OrientationFilter:
     def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise NotImplementedError
 
-    def run(
-        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
-    ) -> FilterRun:
+    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> Orientation:
         """Take samples, `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²], `static` (n,) bool, or one without the n.
 
-        The state continues from the run before. The result fills `out` and is `out`, where it is stated.
+        The state continues from the run before.
         """
-        gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        out = out or make_run(len(gyro), covariance=self.has_covariance)
-        self.bind(gyro, accel, is_static, out)()
+        gyro, accel = as_rows(gyro_S), as_rows(accel_S)
+        counts = len(gyro), len(accel), np.size(static)
+        if min(counts) < max(counts):  # the compiled steps would read beyond an array's end
+            raise BadData("{} rows of gyro_S, {} of accel_S, {} of static: they must be as many".format(*counts))
+        out = make_orientation(len(gyro), self.noise, covariance=self.has_covariance)
+        out.static[:] = static
+        self.bind(gyro, accel, out)()
         return out
 
-    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray, out: FilterRun) -> Callable[[], None]:
-        """Return a call that takes the samples then in these arrays, as `prepare_samples` returns, and fills `out`."""
-        arrays = out[: 4 if self.has_covariance else 2]
-        return partial(self._run, self.state, self.model, gyro_S, accel_S, static, *arrays)
+    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
+        """Return a call that takes the samples then in these arrays and in `out.static`, and fills the rest of `out`.
+
+        The arrays are contiguous, as `as_rows` returns them.
+        """
+        arrays = (out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical)[: 4 if self.has_covariance else 2]
+        return partial(self._run, self.state, self.model, gyro_S, accel_S, out.static, *arrays)
 
 
-def prepare_samples(
-    gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return one sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
-    gyro = np.ascontiguousarray(gyro_S, dtype=float).reshape(-1, 3)
-    accel = np.ascontiguousarray(accel_S, dtype=float).reshape(-1, 3)
-    is_static = np.ascontiguousarray(static, dtype=np.bool_).reshape(-1)
-    if not len(gyro) == len(accel) == len(is_static):  # the compiled steps would read beyond an array's end
-        raise BadData(
-            f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(is_static)} of static: they must be as many"
-        )
-    return gyro, accel, is_static
+def as_rows(values: np.ndarray) -> np.ndarray:
+    """Return one sample (3,) or many (n, 3) as the contiguous rows that the compiled steps take."""
+    return np.ascontiguousarray(values, dtype=float).reshape(-1, 3)
 
 
 @inlined

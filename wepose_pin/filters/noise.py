@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from .. import rotations
-from ..compilation import compiled
 from ..errors import BadData, BadPhase
+from ..recording.limits import STANDARD_GRAVITY
 
 # Smallest standard deviations: a quantised signal may be constant, but no MEMS sensor is more precise, and the
 # covariances stay invertible.
@@ -68,6 +67,18 @@ class SensorNoise:
         # Where the bias is hardly more certain than the sway, a steady rotation is as likely as a bias, while it lasts.
         duration_s = STEADY_TURN_S * min(1.0, bias / total) if bias > 0.3 * total else SWAY_CORRELATION_S
         return (total - white) * duration_s
+
+
+# For a sensor without a static phase: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
+# factory. Only amekf and smoother estimate the bias in motion.
+TYPICAL = SensorNoise(
+    gyro_bias=np.zeros(3),
+    gyro_bias_cov=np.deg2rad(0.5) ** 2 * np.eye(3),
+    gyro_cov=np.deg2rad(0.1) ** 2 * np.eye(3),
+    accel_cov=0.003**2 * np.eye(3),
+    bias_step_cov=2.0 * np.deg2rad(0.1) ** 2 * np.eye(3),
+    gravity=STANDARD_GRAVITY,
+)
 
 
 def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn: bool = False) -> SensorNoise:
@@ -133,34 +144,21 @@ def _compute_cov(values: np.ndarray) -> np.ndarray:
 
 
 def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
-    """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of NumPy's time."""
-    return np.asarray(_average_blocks(np.ascontiguousarray(values, dtype=float), size))
-
-
-@compiled
-def _average_blocks(values, size):  # type: ignore[no-untyped-def]
-    means = np.zeros((len(values) // size, 3))
-    for block in range(len(means)):
-        for k in range(block * size, (block + 1) * size):
-            for axis in range(3):
-                means[block, axis] += values[k, axis]
-    return means / size
+    """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of the time of `mean`."""
+    count = len(values) // size
+    return np.asarray(np.full(size, 1.0 / size) @ values[: count * size].reshape(count, size, 3))
 
 
 def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
     return cov if np.linalg.eigvalsh(cov)[0] >= std**2 else cov + std**2 * np.eye(3)
 
 
-class StartTilt(NamedTuple):
-    """Orientation of a sensor before the first sample of its start phase."""
+def estimate_start_tilt(
+    gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float
+) -> tuple[np.ndarray, float]:
+    """Estimate `quat_VS` (4,), with zero heading, before the first of some static samples from their mean force.
 
-    quat_VS: np.ndarray  # (4,) xyzw, zero heading
-    tilt_std: float  # [rad] one standard deviation of roll and of pitch
-
-
-def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float) -> StartTilt:
-    """Estimate the tilt before the first of some static samples from their mean specific force.
-
+    The second number is one standard deviation of its roll and of its pitch [rad].
     The gyroscope rotates each sample's force into the sensor frame of the first, so that sway does not blur the mean.
     NaN samples are left out.
 
@@ -187,4 +185,4 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
         variance = float(average_blocks(across, size).var(axis=0, ddof=1).sum()) / 2.0 / blocks
     else:  # too short for sway to average out
         variance = float(across.var(axis=0).sum()) / 2.0
-    return StartTilt(rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))
+    return rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -11,13 +11,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..diagnostics import Diagnostic, notebook_html
+from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
 from .amekf import Amekf, AmekfParams
-from .base import FilterRun, OrientationFilter, make_run, run_in_parallel
+from .base import Orientation, OrientationFilter, as_rows, make_orientation, run_in_parallel
 from .complementary import Gdc, Ncf
-from .noise import MOVING_TILT_STD, SensorNoise, StartTilt, estimate_start_tilt
+from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
 from .phases import find_reference_phases
 from .published import PublishedSmekf
 from .smekf import Smekf, SmekfParams
@@ -35,60 +35,6 @@ METHODS: dict[str, type[OrientationFilter]] = {
 BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
 STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
-
-
-class Orientation(NamedTuple):
-    """Orientation of one sensor over time.
-
-    V is the sensor's own world: z up, zero heading at the first sample of the phase from which the filter starts.
-
-    Parameters
-    ----------
-    quat_VS : (n, 4) xyzw
-    gyro_bias : (n, 3) [rad/s]
-    static : (n,) bool, the sensor did not move
-    attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_VS`; None where the filter
-        has none
-    noise : of gyroscope and accelerometer in the static phase
-    diagnostics : what the user should know
-    about_vertical : (n, 3), as in `FilterRun`; None where the filter has no covariance
-    """
-
-    quat_VS: np.ndarray
-    gyro_bias: np.ndarray
-    static: np.ndarray
-    attitude_cov: np.ndarray | None
-    noise: SensorNoise
-    diagnostics: tuple[Diagnostic, ...] = ()
-    about_vertical: np.ndarray | None = None
-
-    def take(self, rows: slice | np.ndarray) -> Orientation:
-        """Take the samples `rows`."""
-        columns = ((name, getattr(self, name)) for name in _SAMPLED)
-        taken: dict[str, Any] = {name: None if each is None else each[rows] for name, each in columns}
-        return self._replace(**taken)
-
-    def __repr__(self) -> str:
-        bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
-        share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
-        return f"Orientation({len(self.quat_VS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
-
-    def _repr_html_(self) -> str:
-        return notebook_html(self, self.diagnostics)
-
-
-_SAMPLED = ("static", *FilterRun._fields)  # what an `Orientation` has of each sample
-
-
-def join_orientations(parts: Sequence[Orientation]) -> Orientation:
-    """Join the samples of one sensor's orientations; what is not of each sample is that of the last part."""
-    columns = {name: [getattr(part, name) for part in parts] for name in _SAMPLED}
-    joined: dict[str, Any] = {k: None if each[0] is None else np.concatenate(each) for k, each in columns.items()}
-    return parts[-1]._replace(**joined)
-
-
-def _describe(run: FilterRun, static: np.ndarray, noise: SensorNoise) -> Orientation:
-    return Orientation(run.quat_VS, run.gyro_bias, static, run.attitude_cov, noise, (), run.about_vertical)
 
 
 def check_method(method: str) -> str:
@@ -116,9 +62,8 @@ class SensorFilters:
     Attributes
     ----------
     names : the k sensors
-    quat_VS, gyro_bias, attitude_cov, about_vertical : (k, …) after the last sample, as `FilterRun`; the next step
-        overwrites them
-    static : (k,) bool, of the last step
+    quat_VS, gyro_bias, static, attitude_cov, about_vertical : (k, …) after the last sample, as `Orientation`; the next
+        step overwrites them
 
     Raises
     ------
@@ -140,8 +85,13 @@ class SensorFilters:
         if METHODS[method] is PublishedSmekf:
             self._test = replace(self._test, rate_stds=np.inf)
         self.names, self._noises = tuple(noises), dict(noises)
-        self._filters: dict[str, Any] = {}
+        self._filters: dict[str, OrientationFilter] = {}
         self._detectors: dict[str, StaticDetector] = {}
+        k = len(self.names)
+        self._now = make_orientation(k, TYPICAL, covariance=METHODS[method].has_covariance)
+        self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
+        self.quat_VS, self.gyro_bias, self.static, self.attitude_cov = self._now[:4]
+        self.about_vertical = self._now.about_vertical
 
     def push(self, chunk: Recording) -> dict[str, Orientation]:
         """Filter a chunk.
@@ -151,18 +101,10 @@ class SensorFilters:
         BadData
             The start phase has no gravity.
         """
-        is_first = not self._filters
         orientations = run_in_parallel(lambda name: self._filter(name, chunk.imus[name], chunk.rate_hz), self.names)
-        if is_first:
-            k = len(self.names)
-            self.static = np.zeros(k, dtype=np.bool_)
-            self._now = make_run(k, covariance=any(each.attitude_cov is not None for each in orientations))
-            self.quat_VS, self.gyro_bias, self.attitude_cov, self.about_vertical = self._now
-            self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
         for i, each in enumerate(orientations):
-            for now, name in zip(self._now, FilterRun._fields, strict=True):
-                if now is not None and len(each.quat_VS):
-                    now[i] = getattr(each, name)[-1]
+            for name, values in each.sampled().items():
+                getattr(self._now, name)[i] = values[-1] if len(values) else getattr(self._now, name)[i]
         return dict(zip(self.names, orientations, strict=True))
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
@@ -182,71 +124,66 @@ class SensorFilters:
         """What a step calls, on arrays that stay: to prepare arguments takes longer than to filter a sample."""
         calls: list[Callable[[], None]] = []
         for i, name in enumerate(self.names):
-            one = slice(i, i + 1)
-            sample = self._gyro_S[one], self._accel_S[one], self.static[one]
-            calls += self._detectors[name].bind(*sample), self._filters[name].bind(*sample, self._now.part(one))
+            gyro_S, accel_S, now = self._gyro_S[i : i + 1], self._accel_S[i : i + 1], self._now.take(slice(i, i + 1))
+            calls.append(self._detectors[name].bind(gyro_S, accel_S, now.static))
+            calls.append(self._filters[name].bind(gyro_S, accel_S, now))
         return calls
 
     def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
         """Filter a chunk of one sensor."""
-        gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
+        gyro_S, accel_S = as_rows(sensor.gyro_S), as_rows(sensor.accel_S)
         if sensor.gap is not None:
             # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
             gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
-        before = None if name in self._filters else self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range)
-        filter_, detector = self._filters[name], self._detectors[name]
-        if before is None or self._method in OFFLINE:
-            static = detector.run(gyro_S, accel_S)
-            run = filter_.run(gyro_S, accel_S, static)
-            if before is not None and run.attitude_cov is not None:
-                # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
-                run.attitude_cov[: len(before.static)] = before.attitude_cov
-            return _describe(run, static, self._noises[name])
-        begin = len(before.static)
-        run, rest = make_run(len(gyro_S), covariance=filter_.has_covariance), slice(begin, None)
-        for field, values in zip(FilterRun._fields, run, strict=True):
-            if values is not None:
-                values[:begin] = getattr(before, field)
-        static = np.concatenate([before.static, detector.run(gyro_S[rest], accel_S[rest])])
-        filter_.run(gyro_S[rest], accel_S[rest], static[rest], run.part(rest))
-        return _describe(run, static, self._noises[name])
+        kind, begin, cov = METHODS[self._method], 0, None
+        out = make_orientation(len(gyro_S), self._noises[name], covariance=kind.has_covariance)
+        if name not in self._filters:
+            begin = self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range, out)
+        if self._method in OFFLINE and out.attitude_cov is not None:  # forward over all samples
+            begin, cov = 0, out.attitude_cov[:begin].copy()
+        rest = out.take(slice(begin, None))
+        self._detectors[name].bind(gyro_S[begin:], accel_S[begin:], rest.static)()
+        self._filters[name].bind(gyro_S[begin:], accel_S[begin:], rest)()
+        if cov is not None and out.attitude_cov is not None:
+            # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
+            out.attitude_cov[: len(cov)] = cov
+        return out
 
     def _begin(
-        self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float
-    ) -> Orientation | None:
-        """Create the filter; return what lies before its first sample, filtered backward."""
+        self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float, out: Orientation
+    ) -> int:
+        """Create the filter; fill `out` before its first sample by filtering backward, and return that sample."""
         noise, phase = self._noises[name], self._start or slice(0, self._test.samples(rate_hz))
-        start = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
+        quat_VS, tilt_std = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
         if self._start is None:  # the sensor may move there
-            start = start._replace(tilt_std=MOVING_TILT_STD)
-        first, before = phase.start, None
+            tilt_std = MOVING_TILT_STD
+        first = phase.start
 
-        def create(method: str, noise: SensorNoise, start: StartTilt) -> Any:
+        def create(method: str, noise: SensorNoise, quat_VS: np.ndarray) -> OrientationFilter:
             params, params_type = self._params, METHODS[method].params_type
             if params_type in (AmekfParams, SmekfParams):
-                params = params or params_type(tilt_std=start.tilt_std)
+                params = params or params_type(tilt_std=tilt_std)
                 params = replace(params, gyro_range=min(gyro_range, params.gyro_range))
-            return METHODS[method](noise, rate_hz, start.quat_VS, params)
+            return METHODS[method](noise, rate_hz, quat_VS, params)
 
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
             turn = np.nan_to_num(gyro_S[first] - noise.gyro_bias) / rate_hz
             mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
-            gyro, accel = -gyro_S[first:0:-1], accel_S[first - 1 :: -1]
+            gyro, accel = as_rows(-gyro_S[first:0:-1]), as_rows(accel_S[first - 1 :: -1])
             static = StaticDetector(mirrored, rate_hz, self._test).run(gyro, accel)
-            turned_back = start._replace(quat_VS=rotations.turned(start.quat_VS, turn))
-            run = create(BEST if self._method in OFFLINE else self._method, mirrored, turned_back).run(
-                gyro, accel, static
-            )
-            cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
-            # What the backward run has corrected is no correction of the forward run.
-            vertical = None if run.about_vertical is None else np.zeros_like(run.about_vertical)
-            before = _describe(FilterRun(run.quat_VS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1], noise)
+            method = BEST if self._method in OFFLINE else self._method
+            run = create(method, mirrored, rotations.turned(quat_VS, turn)).run(gyro, accel, static)
+            for field, values in run.sampled().items():
+                getattr(out, field)[:first] = values[::-1]
+            out.gyro_bias[:first] *= -1.0
+            if out.about_vertical is not None:  # what the backward run has corrected is none of the forward run
+                out.about_vertical[:first] = 0.0
             if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
                 turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
-                start = StartTilt(rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD)
-        self._filters[name] = create(self._method, noise, start)
+                quat_VS, tilt_std = rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD
+        self._filters[name] = create(self._method, noise, quat_VS)
         self._detectors[name] = StaticDetector(noise, rate_hz, self._test)
-        return before
+        return int(first)
 
 
 def run_filter(

@@ -201,7 +201,7 @@ class Smekf(OrientationFilter):
             turned=0.0,  # [rad] net rotation about the vertical since the start
             last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
             lost_s=0.0,  # [s] the same
-            about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `FilterRun`
+            about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
             R_VS=np.zeros((3, 3)),
         )
         gyro_var, accel_var, step_var = (

@@ -13,12 +13,15 @@ corrections of both ends in proportion. Time is linear in the samples; the block
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from ..compilation import compiled
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
-from .base import HEADING, RATE, RATE_VAR, FilterRun, OrientationFilter, into_sensor
+from .base import HEADING, RATE, RATE_VAR, Orientation, OrientationFilter, into_sensor
 
 COUNT = len(SMOOTHED_STATES)
 
@@ -35,18 +38,18 @@ class Smoother(OrientationFilter):
         filter_ = Amekf(self.noise, self.rate_hz, quat_VS, self.params)
         return filter_.state, filter_.model
 
-    def run(
-        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
-    ) -> FilterRun:
-        """Smooth a whole recording; each call starts anew, so a recording cut in two is two recordings."""
+    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
+        """Return a call that smooths a whole recording; each call starts anew, so one cut in two is two recordings."""
+        return partial(self._smooth, gyro_S, accel_S, out)
+
+    def _smooth(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> None:
         amekf = Amekf(self.noise, self.rate_hz, self.state["quat_VS"][0], self.params)
-        is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
         P_rows, size = amekf.state["P"][0, list(SMOOTHED_STATES), :STATES], int(amekf.model["block_samples"][0])
-        amekf.blocks = blocks = np.empty(len(is_static) // size, BLOCK)
-        run = amekf.run(gyro_S, accel_S, is_static, out)
+        amekf.blocks = blocks = np.empty(len(gyro_S) // size, BLOCK)
+        amekf.bind(gyro_S, accel_S, out)()
         smoothed = _backward(blocks, P_rows, self.noise.gravity)
-        _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, is_static, *run)
-        return run
+        arrays = out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical
+        _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, out.static, *arrays)
 
 
 @compiled

@@ -24,7 +24,7 @@ from scipy.special import gammainc, gammaincinv
 from ..arguments import NonNegative, Positive, Range, check_fields, format_settings
 from ..compilation import inlined, kernel
 from ..errors import BadOption
-from .base import make_record, prepare_samples
+from .base import as_rows, make_record
 from .noise import BLOCK_S, SensorNoise
 
 # A sample is gyro [rad/s] (3), accel/g (3) and the norm of accel/g. Sums over samples are of these, of the products of
@@ -124,8 +124,7 @@ class StaticDetector:
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
         static = np.empty(len(gyro_S), dtype=np.bool_)
-        gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
-        self.bind(gyro, accel, static)()
+        self.bind(as_rows(gyro_S), as_rows(accel_S), static)()
         return static
 
     def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray) -> Callable[[], None]:

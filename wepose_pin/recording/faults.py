@@ -16,6 +16,7 @@ import numpy as np
 from ..compilation import inlined, kernel
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
+from .gaps import find_runs
 from .intervals import format_time
 from .limits import NARROWEST_GYRO_RANGE
 
@@ -83,7 +84,7 @@ def check_sensors(
     """
     imus = {name: _take_numbers(*each) for name, each in samples.items() if len(each) == 3}
     for (name, a), (other, b) in combinations(imus.items(), 2):
-        if all(map(np.array_equal, a[1:], b[1:])) and len(a[0]) - len(_find_repeats(*a[1:])) > FROZEN_SAMPLES:
+        if all(map(np.array_equal, a[1:], b[1:])) and np.count_nonzero(~_mark_repeats(*a[1:])) > FROZEN_SAMPLES:
             raise BadData(
                 f"{where}: sensors.{name} and sensors.{other} hold the same values in {len(a[0])} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
@@ -136,14 +137,14 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     faults: dict[str, list[Fault]] = {}
     for name, (time, gyro_S, accel_S) in samples.items():
         covered = np.zeros(len(time), dtype=bool)
-        of_gyro, of_accel = _find_repeats(gyro_S), _find_repeats(accel_S)
+        of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
         for signals, columns, repeats, least_s in (
-            (BOTH, (gyro_S, accel_S), np.intersect1d(of_gyro, of_accel, assume_unique=True), FROZEN_S),
+            (BOTH, (gyro_S, accel_S), of_gyro & of_accel, FROZEN_S),
             (GYRO, (gyro_S,), of_gyro, STUCK_S),
             (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
-            begins = np.flatnonzero(np.diff(repeats, prepend=-1) > 1)
-            first, last = repeats[begins] - 1, np.append(repeats[begins[1:] - 1], repeats[-1:])
+            runs = np.array(find_runs(repeats)).reshape(-1, 2) if repeats.any() else np.zeros((0, 2), dtype=int)
+            first, last = runs.T - 1
             length = last - first + 1
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             if not long.any():
@@ -168,13 +169,18 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     return faults
 
 
-def _find_repeats(*signals: np.ndarray) -> np.ndarray:
-    """Find the rows (m,) in which all signals (n, 3) repeat the row before."""
-    first, *others = (signal[:, k] for signal in signals for k in range(3))
-    rows = np.flatnonzero(first[1:] == first[:-1]) + 1
-    for column in others:  # few are left after the first
-        rows = rows[column[rows] == column[rows - 1]]
-    return rows
+def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
+    """Mark the rows (n,) in which all signals (n, 3) repeat the row before."""
+    repeats = np.ones(len(signals[0]), dtype=np.bool_)
+    for signal in signals:
+        _unmark_changes(np.ascontiguousarray(signal), repeats)
+    return repeats
+
+
+@kernel
+def _unmark_changes(values, repeats):  # type: ignore[no-untyped-def]
+    for row in range(len(values)):
+        repeats[row] = repeats[row] and row > 0 and is_same(values[row - 1], values[row])
 
 
 @kernel
@@ -218,7 +224,7 @@ def find_gyro_range(gyro_S: np.ndarray, accel_S: np.ndarray) -> float:
     """Find the rate [rad/s] from which an axis of gyro counts as saturated, of samples (n, 3); infinite: none is."""
     levels = _find_levels(gyro_S, NARROWEST_GYRO_RANGE)
     if np.isfinite(levels).any():  # a frozen sensor stands, too
-        levels = _find_levels(np.delete(gyro_S, _find_repeats(gyro_S, accel_S), axis=0), NARROWEST_GYRO_RANGE)
+        levels = _find_levels(gyro_S[~_mark_repeats(gyro_S, accel_S)], NARROWEST_GYRO_RANGE)
     return float((1.0 - AT_RANGE) * levels.min())
 
 

@@ -54,7 +54,7 @@ class HeadingFilter:
     """The state and its covariance, knot by knot.
 
     What the orientation filters of the k sensors know after a sample is `filters` (4, k): the variance [rad²] of the
-    heading, and the columns of `FilterRun.about_vertical`; NaN without a covariance.
+    heading, and the columns of `Orientation.about_vertical`; NaN without a covariance.
 
     Parameters
     ----------

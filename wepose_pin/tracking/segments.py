@@ -53,7 +53,7 @@ class SegmentEstimator:
     it is lost its last one stands causally, else the reader has interpolated. The smoother takes the whole recording.
 
     What the filters of the k sensors state after n samples is `quat_VS` (n, k, 4) xyzw, of measured orientations too,
-    the attitude's covariance (n, k, 3, 3) [rad²] and `about_vertical` (n, k, 3) as in `FilterRun`; NaN where there is
+    the attitude's covariance (n, k, 3, 3) [rad²] and `about_vertical` (n, k, 3) as in `Orientation`; NaN where there is
     no filter, or it has no covariance.
 
     Parameters
