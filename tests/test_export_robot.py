@@ -15,21 +15,10 @@ import pinocchio as pin
 import polars as pl
 import pytest
 from arms import JOINTS, write_arm
-from scipy.spatial.transform import Rotation
+from commands import run
 from test_export import a_pose, write_folder
 
-from wepose_pin.body.subject import population_subject
-from wepose_pin.commands import main
-from wepose_pin.errors import WeposeError
-from wepose_pin.tracking import TrackResult
-from wepose_pin.writers.export import export
-from wepose_pin.writers.motion import (
-    JointMotion,
-    compute_link_poses_W,
-    read_joint_motion,
-    resample_joints,
-)
-from wepose_pin.writers.result import read_result, write_table
+from wepose_pin import WeposeError, export
 
 RATE_HZ = 50.0
 APPROACH_S = 2.0
@@ -48,7 +37,7 @@ def write_trajectory_folder(folder: Path, seed: int = 1, seconds: float = 8.0, r
         columns[name] = size * np.sin(speed * time + phase) - 0.4
         columns[f"{name}_velocity"] = size * speed * np.cos(speed * time + phase)
         columns[f"{name}_acceleration"] = -size * speed**2 * np.sin(speed * time + phase)
-    write_table(folder / "trajectory.parquet", pl.DataFrame(columns))
+    pl.DataFrame(columns).write_parquet(folder / "trajectory.parquet")
     w, x, y, z = 0.5, 0.5, -0.5, 0.5
     summary = {
         "robot": "arm",
@@ -69,47 +58,26 @@ def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_trajectory_folder(tmp_path_factory.mktemp("robot") / "arm")
 
 
-@pytest.fixture(scope="module")
-def motion(trajectory: Path) -> JointMotion:
-    return read_joint_motion(trajectory)
+def read_positions(folder: Path) -> np.ndarray:
+    """(n, 7) [rad] of a trajectory's joints."""
+    return pl.read_parquet(folder / "trajectory.parquet").select(JOINTS).to_numpy()
 
 
-# Kinematics -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("options", [{"turned": (0.3, -0.2, 0.5), "continuous": "yaw"}, {"mimic": True}])
-def test_links_are_where_pinocchio_has_them(tmp_path: Path, options: dict[str, object]) -> None:
-    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.1)
-    (tmp_path / "other").mkdir()
-    write_arm(tmp_path / "other", **options).replace(folder / "robot.urdf")
-    motion = read_joint_motion(folder)
+def place_by_pinocchio(folder: Path, k: int, root: pin.SE3 | None = None) -> dict[str, np.ndarray]:
+    """Link → (4, 4) in W at a sample of a trajectory, or from another root."""
+    if root is None:
+        at = json.loads((folder / "summary.json").read_text())["root"]
+        root = pin.XYZQUATToSE3(np.array([at[name] for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]))
     model = pin.buildModelFromUrdf(str(folder / "robot.urdf"))
-    data, root = model.createData(), pin.XYZQUATToSE3(np.concatenate([motion.p_WB, motion.quat_WB]))
-    poses = compute_link_poses_W(motion)
-    for k in range(5):
-        q = pin.neutral(model)
-        for joint in range(1, model.njoints):
-            name = model.names[joint]
-            value = motion.values("elbow" if name == "elbow_copy" else name)[k]
-            first = model.idx_qs[joint]
-            q[first : first + model.nqs[joint]] = value if model.nqs[joint] == 1 else (np.cos(value), np.sin(value))
-        pin.framesForwardKinematics(model, data, q)
-        for link, (quat, p) in poses.items():
-            expected = root * data.oMf[model.getFrameId(link, pin.FrameType.BODY)]
-            np.testing.assert_allclose(p[k], expected.translation, atol=1e-12)
-            np.testing.assert_allclose(Rotation.from_quat(quat[k]).as_matrix(), expected.rotation, atol=1e-12)
-
-
-def test_another_rate_is_on_the_cubics(tmp_path: Path, motion: JointMotion) -> None:
-    """A cubic through values and slopes of sin(wt) is off by at most (wh)^4 / 384."""
-    finer = resample_joints(motion, 400.0)
-    truth = read_joint_motion(write_trajectory_folder(tmp_path / "arm", rate_hz=400.0))
-    n = len(finer.time)
-    np.testing.assert_allclose(finer.time, truth.time[:n], atol=1e-12)
-    assert np.abs(finer.position - truth.position[:n]).max() < 0.8 * (2.0 / RATE_HZ) ** 4 / 384
-    again = resample_joints(finer, RATE_HZ)
-    np.testing.assert_allclose(again.position, motion.position, atol=1e-14)
-    assert again.begin == motion.begin == 100
+    data, q = model.createData(), pin.neutral(model)
+    row = dict(zip(JOINTS, read_positions(folder)[k], strict=True))
+    for joint in range(1, model.njoints):
+        name, first = model.names[joint], model.idx_qs[joint]
+        value = row["elbow" if name == "elbow_copy" else name]
+        q[first : first + model.nqs[joint]] = value if model.nqs[joint] == 1 else (np.cos(value), np.sin(value))
+    pin.framesForwardKinematics(model, data, q)
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    return {link: (root * data.oMf[model.getFrameId(link, pin.FrameType.BODY)]).homogeneous for link in links}
 
 
 # LeRobot ----------------------------------------------------------------------------------------------------------
@@ -119,7 +87,7 @@ def read_frames(folder: Path) -> pl.DataFrame:
     return pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
 
 
-def test_each_result_is_an_episode(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+def test_each_result_is_an_episode(trajectory: Path, tmp_path: Path) -> None:
     other = write_trajectory_folder(tmp_path / "other", seed=2, seconds=3.0)
     assert export([trajectory, str(other)], tmp_path / "data", "lerobot") == ("lerobot", [])
     frames, info = read_frames(tmp_path / "data"), json.loads((tmp_path / "data/meta/info.json").read_text())
@@ -128,7 +96,7 @@ def test_each_result_is_an_episode(trajectory: Path, motion: JointMotion, tmp_pa
     assert info["features"]["action"] == {"dtype": "float32", "shape": [7], "names": list(JOINTS)}
     assert not any("/" in feature for feature in info["features"])
     state, action = (frames[name].to_numpy() for name in ("observation.state", "action"))
-    np.testing.assert_array_equal(state[:400], motion.position.astype(np.float32))
+    np.testing.assert_array_equal(state[:400], read_positions(trajectory).astype(np.float32))
     np.testing.assert_array_equal(action[:399], state[1:400])
     np.testing.assert_array_equal(action[399], state[399])  # and not the first of the next episode
     assert frames["index"].to_list() == list(range(550))
@@ -139,20 +107,19 @@ def test_each_result_is_an_episode(trajectory: Path, motion: JointMotion, tmp_pa
     assert episodes["dataset_to_index"].to_list() == [400, 550]
 
 
-def test_repetitions_and_phases_are_episodes(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+def test_repetitions_and_phases_are_episodes(trajectory: Path, tmp_path: Path) -> None:
+    """The recording's 1.5 s are at 2 s of the trajectory: the approach before belongs to no phase."""
+    position = read_positions(trajectory)
     export(trajectory, tmp_path / "r", "lerobot", episodes="repetitions", instruction="wave")
     frames = read_frames(tmp_path / "r")
     assert frames["episode_index"].value_counts(sort=True)["count"].to_list() == [41, 41, 41]
-    first = motion.samples((1.6, 2.4))
-    assert motion.recorded_time[[first.start, first.stop - 1]] == pytest.approx([1.6, 2.4])
-    np.testing.assert_array_equal(frames["action"].to_numpy()[40], motion.position[first.stop].astype(np.float32))
+    np.testing.assert_array_equal(frames["observation.state"].to_numpy()[0], position[105].astype(np.float32))
+    np.testing.assert_array_equal(frames["action"].to_numpy()[40], position[146].astype(np.float32))
     assert pl.read_parquet(tmp_path / "r/meta/tasks.parquet")["__index_level_0__"].to_list() == ["wave"]
     export([trajectory], tmp_path / "p", "lerobot", episodes="reach", rate_hz=25.0)
-    assert read_frames(tmp_path / "p")["episode_index"].value_counts(sort=True)["count"].to_list() == [30, 26]
-    # The approach, during which the recording has not begun, belongs to no phase.
-    np.testing.assert_allclose(
-        read_frames(tmp_path / "p")["observation.state"].to_numpy()[0], motion.position[motion.begin], atol=1e-6
-    )
+    frames = read_frames(tmp_path / "p")
+    assert frames["episode_index"].value_counts(sort=True)["count"].to_list() == [30, 26]
+    np.testing.assert_allclose(frames["observation.state"].to_numpy()[0], position[100], atol=1e-6)
 
 
 def test_an_interval_outside_is_left_out_and_the_others_are_episodes(trajectory: Path, tmp_path: Path) -> None:
@@ -186,7 +153,7 @@ def find_lerobot() -> str:
 
 
 @pytest.mark.peer
-def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+def test_lerobot_loads_it(trajectory: Path, tmp_path: Path) -> None:
     """lerobot needs PyTorch: WEPOSE_LEROBOT names the Python of an environment that has it."""
     python = find_lerobot()
     other = write_trajectory_folder(tmp_path / "other", seed=2)
@@ -195,17 +162,11 @@ def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path)
     ran = subprocess.run([python, "-W", "ignore", str(script), str(tmp_path / "data")], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     got = json.loads(ran.stdout)
-    whole = (motion, read_joint_motion(other))
-    spans = [[each.samples(span) for span in each.phases["reach"]] for each in whole]
+    whole = [
+        (read_positions(folder), at) for folder in (trajectory, other) for at in (slice(100, 151), slice(175, 236))
+    ]
     state, action = (
-        np.concatenate(
-            [
-                each.position[span.start + k : span.stop + k]
-                for each, own in zip(whole, spans, strict=True)
-                for span in own
-            ]
-        ).astype(np.float32)
-        for k in (0, 1)
+        np.concatenate([rows[at.start + k : at.stop + k] for rows, at in whole]).astype(np.float32) for k in (0, 1)
     )
     assert (got["fps"], got["robot"], got["joints"], got["dtype"]) == (50, "arm", list(JOINTS), "torch.float32")
     assert (got["episodes"], got["lengths"], got["frames"]) == (4, [51, 61, 51, 61], 224)
@@ -234,7 +195,8 @@ def test_why_a_recording_has_no_repetitions_is_said(tmp_path: Path, capsys: pyte
 
 
 def change_table(folder: Path, change: pl.Expr) -> None:
-    write_table(folder / "trajectory.parquet", pl.read_parquet(folder / "trajectory.parquet").with_columns(change))
+    file = folder / "trajectory.parquet"
+    pl.read_parquet(file).with_columns(change).write_parquet(file)
 
 
 def change_urdf(folder: Path, old: str, new: str) -> None:
@@ -269,10 +231,9 @@ def test_a_spoiled_trajectory_takes_one_line(
 
 
 def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["export", *arguments])
+    assert run("export", *arguments) == 2
     error = capsys.readouterr().err
-    assert (stop.value.code, error.count("\n")) == (2, 1), error
+    assert error.count("\n") == 1, error
     assert said in error
 
 
@@ -322,11 +283,4 @@ def test_a_person_is_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     folder = write_folder(tmp_path / "r", a_pose(n=5))
     arguments = [str(folder), "-o", str(tmp_path / "d"), "--format", "lerobot"]
     assert_refused(capsys, arguments, "is of a robot's trajectory, as `wepose retarget` writes it")
-    with pytest.raises(WeposeError, match="is of a robot's trajectory, as `wepose retarget` writes it"):
-        export(load_result_of(folder), tmp_path / "d", "lerobot")
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
-
-
-def load_result_of(folder: Path) -> TrackResult:
-    pose, model, _ = read_result(folder)
-    return TrackResult("made", pose, model, population_subject())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,20 +9,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-import trimesh
-from arms import JOINTS
+from arms import JOINTS, write_arm
 from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, a_pose, write_folder
-from test_export_robot import write_trajectory_folder
+from test_export_robot import place_by_pinocchio, read_positions, write_trajectory_folder
 
-from wepose_pin.body import load_model
+from wepose_pin import BadOption, Pose, export, load_model
 from wepose_pin.body.configuration import solve_configuration
-from wepose_pin.body.kinematics import Pose
 from wepose_pin.body.links import compute_link_poses
-from wepose_pin.errors import BadOption
-from wepose_pin.writers.export import export
-from wepose_pin.writers.motion import JointMotion, compute_link_poses_W, read_joint_motion
-from wepose_pin.writers.rrd import _load_meshes
 
 pytest.importorskip("rosbags")
 
@@ -31,11 +24,6 @@ pytest.importorskip("rosbags")
 @pytest.fixture(scope="module")
 def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_trajectory_folder(tmp_path_factory.mktemp("robot") / "arm", seconds=3.0)
-
-
-@pytest.fixture(scope="module")
-def motion(trajectory: Path) -> JointMotion:
-    return read_joint_motion(trajectory)
 
 
 @pytest.fixture(scope="module")
@@ -89,29 +77,35 @@ def place_links(messages: dict[str, list[Any]], k: int) -> dict[str, np.ndarray]
     return {link: place(link) for link in parents}
 
 
-@pytest.mark.parametrize(("name", "read"), [("bag", read_bag), ("x.mcap", read_bag), ("x.mcap", read_mcap)])
+@pytest.mark.parametrize(
+    ("name", "read", "options"),
+    [
+        ("bag", read_bag, {}),
+        ("x.mcap", read_bag, {"turned": (0.3, -0.2, 0.5), "continuous": "yaw"}),
+        ("x.mcap", read_mcap, {"mimic": True}),
+    ],
+)
 def test_a_bag_has_the_joints_and_the_links_of_the_robot(
-    trajectory: Path, motion: JointMotion, tmp_path: Path, name: str, read: Any
+    tmp_path: Path, name: str, read: Any, options: dict[str, Any]
 ) -> None:
-    assert export(trajectory, tmp_path / name, "mcap" if "." in name else "rosbag").diagnostics == []
+    """Of a robot whose base is turned, whose joint turns without end, or is a copy of another."""
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=3.0)
+    (tmp_path / "other").mkdir()
+    write_arm(tmp_path / "other", **options).replace(folder / "robot.urdf")
+    assert export(folder, tmp_path / name, "mcap" if "." in name else "rosbag").diagnostics == []
     messages = read(tmp_path / name)
-    assert {topic: len(each) for topic, each in messages.items()} == {
-        "/robot_description": 1,
-        "/tf_static": 1,
-        "/joint_states": 150,
-        "/tf": 150,
-    }
-    assert messages["/robot_description"][0][1].data == (trajectory / "robot.urdf").read_text()
+    counts = {topic: len(each) for topic, each in messages.items()}
+    assert counts == {"/robot_description": 1, "/tf_static": 1, "/joint_states": 150, "/tf": 150}
+    assert messages["/robot_description"][0][1].data == (folder / "robot.urdf").read_text()
     for k in (0, 1, 149):
         time_ns, state = messages["/joint_states"][k]
         assert list(state.name) == list(JOINTS)
-        np.testing.assert_array_equal(state.position, motion.position[k])
-        np.testing.assert_array_equal(state.velocity, motion.velocity[k])
+        np.testing.assert_array_equal(state.position, read_positions(folder)[k])
         assert time_ns == state.header.stamp.sec * 10**9 + state.header.stamp.nanosec == max(1, k * 20_000_000)
-        placed = place_links(messages, k)
-        for link, (quat, p) in compute_link_poses_W(motion).items():
-            np.testing.assert_allclose(placed[link][:3, 3], p[k], atol=1e-12)
-            np.testing.assert_allclose(placed[link][:3, :3], Rotation.from_quat(quat[k]).as_matrix(), atol=1e-12)
+        placed, expected = place_links(messages, k), place_by_pinocchio(folder, k)
+        assert set(expected) - set(placed) <= {"world"}
+        for link, M in placed.items():
+            np.testing.assert_allclose(M, expected[link], atol=1e-12)
 
 
 def test_a_person_is_a_robot_of_revolute_joints(result: Path, pose: Pose, tmp_path: Path) -> None:
@@ -139,13 +133,18 @@ def test_a_person_is_a_robot_of_revolute_joints(result: Path, pose: Pose, tmp_pa
             np.testing.assert_allclose(placed[link][:3, 3], p_W[k, i], atol=1e-9)
 
 
-def test_a_rate_and_a_phase_of_a_trajectory(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+def test_a_rate_and_a_phase_of_a_trajectory(trajectory: Path, tmp_path: Path) -> None:
+    """Between samples it is on the cubics: of sin(wt) they are off by at most (wh)^4 / 384."""
     export(trajectory, tmp_path / "x.mcap", phase="reach:1", rate_hz=25.0)
     states = read_bag(tmp_path / "x.mcap")["/joint_states"]
     assert len(states) == 25
     assert states[0][0] == 2_000_000_000
     for k in (0, 1, 24):
-        np.testing.assert_allclose(states[k][1].position, motion.position[100 + 2 * k], atol=1e-12)
+        np.testing.assert_allclose(states[k][1].position, read_positions(trajectory)[100 + 2 * k], atol=1e-12)
+    export(trajectory, tmp_path / "y.mcap", rate_hz=400.0)
+    finer = np.array([state.position for _, state in read_bag(tmp_path / "y.mcap")["/joint_states"]])
+    truth = read_positions(write_trajectory_folder(tmp_path / "arm", seconds=3.0, rate_hz=400.0))
+    assert np.abs(finer - truth[: len(finer)]).max() < 0.8 * (2.0 / 50.0) ** 4 / 384
 
 
 @pytest.mark.parametrize(
@@ -161,32 +160,8 @@ def test_without_its_package_a_format_says_which(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_meshes_are_in_the_frames_of_their_links(trajectory: Path, tmp_path: Path) -> None:
-    """Scaled and placed as the URDF says; none where a file is not found."""
-    folder = tmp_path / "robot"
-    shutil.copytree(trajectory, folder)
-    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
-    (folder / "parts").mkdir()
-    trimesh.Trimesh(corners, faces, process=False).export(folder / "parts" / "hand.stl")
-    mesh = '<geometry><mesh filename="package://parts/hand.stl" scale="0.1 0.2 0.3"/></geometry>'
-    visual = f'<visual><origin xyz="0.01 0.02 0.03" rpy="0 0 {np.pi / 2.0}"/>{mesh}</visual>'
-    urdf = (folder / "robot.urdf").read_text()
-    assert urdf.count('<link name="hand">') == 1
-    (folder / "robot.urdf").write_text(urdf.replace('<link name="hand">', f'<link name="hand">{visual}'))
-    ((link, (vertices, triangles), _),) = _load_meshes(read_joint_motion(folder))
-    expected = (corners * [0.1, 0.2, 0.3])[:, [1, 0, 2]] * [-1.0, 1.0, 1.0] + [0.01, 0.02, 0.03]
-    assert link == "hand"
-    assert len(triangles) == 4
-    np.testing.assert_allclose(sorted(map(tuple, vertices)), sorted(map(tuple, expected)), atol=1e-6)
-    (folder / "parts" / "hand.stl").unlink()
-    assert _load_meshes(read_joint_motion(folder)) == []
-
-
 @pytest.mark.peer
-def test_rerun_reads_the_recording(
-    trajectory: Path, motion: JointMotion, result: Path, pose: Pose, tmp_path: Path
-) -> None:
+def test_rerun_reads_the_recording(trajectory: Path, result: Path, pose: Pose, tmp_path: Path) -> None:
     """By rerun's own catalogue (rerun-sdk[catalog]); numbers are single precision there."""
     rr = pytest.importorskip("rerun")
     pytest.importorskip("datafusion")
@@ -196,12 +171,12 @@ def test_rerun_reads_the_recording(
         robot, person = (server.client().get_dataset(name) for name in ("robot", "person"))
         table = robot.filter_contents(["/joints/elbow", "/body/hand"]).reader(index="time").to_arrow_table()
         seconds = np.array([time.total_seconds() for time in table["time"].to_pylist()])
-        np.testing.assert_allclose(seconds, motion.time, atol=1e-9)
+        np.testing.assert_allclose(seconds, np.arange(150) / 50.0, atol=1e-9)
         elbow = np.array(table["/joints/elbow:Scalars:scalars"].to_pylist())[:, 0]
-        np.testing.assert_array_equal(elbow, motion.values("elbow"))
-        _, p = compute_link_poses_W(motion)["hand"]
+        np.testing.assert_array_equal(elbow, read_positions(trajectory)[:, JOINTS.index("elbow")])
         at = np.array(table["/body/hand:Transform3D:translation"].to_pylist())[:, 0]
-        np.testing.assert_allclose(at, p, atol=1e-6)
+        for k in (0, 149):
+            np.testing.assert_allclose(at[k], place_by_pinocchio(trajectory, k)["hand"][:3, 3], atol=1e-6)
         table = person.filter_contents(["/body/left_forearm"]).reader(index="time").to_arrow_table()
         turned = np.array(table["/body/left_forearm:Transform3D:quaternion"].to_pylist())[:, 0]
         np.testing.assert_allclose(np.abs(np.sum(turned * pose.quat_WL["left_forearm"], axis=1)), 1.0, atol=1e-6)

@@ -10,12 +10,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from arms import JOINTS
-from test_export_robot import find_lerobot, write_trajectory_folder
+from test_export_robot import find_lerobot, place_by_pinocchio, write_trajectory_folder
 
-from wepose_pin.writers.export import export
-from wepose_pin.writers.motion import compute_link_poses_W, read_joint_motion
+from wepose_pin import export
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "play.md"
 SCRIPTS = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL))
@@ -81,11 +81,8 @@ def test_mujoco_plays_it(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(spec.to_xml(), encoding="utf-8")
     printed = run("play_mujoco.py", tmp_path, folder, tmp_path / "arm.xml")
     assert printed.startswith("7 joints, 120 samples; the last body at [")
-    motion = read_joint_motion(folder)
-    placed = {name: values for name, values in vars(motion).items() if name not in ("p_WB", "quat_WB")}
-    at_root = type(motion)(**placed, p_WB=np.zeros(3), quat_WB=np.array([0.0, 0.0, 0.0, 1.0]))
     numbers = [float(number) for number in re.findall(r"-?\d+\.\d+(?:e-\d+)?", printed.partition("[")[2])]
-    np.testing.assert_allclose(numbers, compute_link_poses_W(at_root)["hand"][1][-1], atol=1e-6)
+    np.testing.assert_allclose(numbers, place_by_pinocchio(folder, -1, pin.SE3.Identity())["hand"][:3, 3], atol=1e-6)
 
 
 def test_a_controller_gets_the_trajectory(tmp_path: Path) -> None:
