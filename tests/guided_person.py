@@ -14,10 +14,9 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from wepose_pin import MILD_PRESET, Simulation, simulate, simulate_person
 from wepose_pin.live.sources.base import Source
-from wepose_pin.recording.arrivals import Samples, pack_orientations, unpack_orientations
-from wepose_pin.rotations import exp, multiply
-from wepose_pin.simulation import PRESETS, Simulation, simulate, simulate_person
+from wepose_pin.recording.arrivals import Samples
 
 RATE_HZ = 100.0
 STAND = 60, 440  # samples of the simulation in which the person stands
@@ -28,12 +27,10 @@ TRACKERS = tuple(f"4c:11:ae:00:00:a{k}/0" for k in range(5))
 
 
 @lru_cache(maxsize=4)
-def perform(
-    seed: int = 3, clasp_s: float = 100.0, preset: str = "mild", mount: str = "any", protocol: str = "clasp"
-) -> Simulation:
+def perform(seed: int = 3, clasp_s: float = 100.0, mount: str = "any", protocol: str = "clasp") -> Simulation:
     """A person whose clasp lasts longer than the guide asks for."""
     lengths = simulate_person(seed).lengths
-    imperfections = replace(PRESETS[preset], mount=mount, dropped=0.0)
+    imperfections = replace(MILD_PRESET, mount=mount, dropped=0.0)
     return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0, protocol=protocol)
 
 
@@ -92,7 +89,8 @@ class GuidedPerson:
             if segment in self.silent:
                 continue
             if self.orientations:
-                samples[sensor] = pack_orientations(self._orient(segment, time_s))
+                quat = self._orient(segment, time_s)
+                samples[sensor] = quat[:3], np.array([quat[3], 0.0, 0.0])  # six numbers, as sources give them
             else:
                 samples[sensor] = gyro, accel
         return time_s, samples
@@ -108,11 +106,12 @@ class GuidedPerson:
         """Orientation (4,) xyzw of a segment in W, or of its sensor in a world of its own; a shake turns it."""
         if self.orientations == "segment":
             return self.simulation.quat_WL[segment][self._k]
-        quat = self.simulation.quat_WS[segment][self._k]
+        R = Rotation.from_quat(self.simulation.quat_WS[segment][self._k])
         if self.doing == f"shake {segment}" and time_s % 3.0 < 1.5:
             angle = SHAKE_RATE / (2.0 * np.pi * SHAKE_HZ) * np.cos(2.0 * np.pi * SHAKE_HZ * time_s)
-            quat = multiply(quat, exp([angle, 0.0, 0.0]))
-        return multiply(exp([0.0, 0.0, 0.7 * list(self.worn.values()).index(segment)]), quat)
+            R = R * Rotation.from_rotvec([angle, 0.0, 0.0])
+        own = Rotation.from_rotvec([0.0, 0.0, 0.7 * list(self.worn.values()).index(segment)])
+        return np.array((own * R).as_quat())
 
 
 class PersonSource(Source):
@@ -208,5 +207,5 @@ class TrackerPerson(UdpPerson):
                 hello = struct.pack(">IQ7I", 3, 0, *(0,) * 7) + b"\x05v0.6." + mac + b"\0"
                 self._sockets[name].sendto(hello, self._to)
             self._numbers[name] += 1
-            quat = unpack_orientations(*numbers)
+            quat = [*numbers[0], numbers[1][0]]
             self._sockets[name].sendto(struct.pack(">IQBB4fB", 17, self._numbers[name], 0, 1, *quat, 0), self._to)

@@ -14,7 +14,7 @@ import pytest
 from listening import NO_PROC, list_listening
 from sampling import collect, connected, find_free_port, wait_until
 
-from wepose_pin.errors import BadSource
+from wepose_pin import BadSource
 from wepose_pin.live.sources import lsl, open_source
 
 RATE = 100.0

@@ -48,6 +48,7 @@ class Device:
         self.items: list[tuple[int, int]] = [(0x4020, 100), (0x8020, 100)]
         self.asked: list[tuple[int, bytes]] = []
         self.ticks = 0
+        self.packet, self.noise = b"", lambda: b""  # of its own, and between all
         self._stop = threading.Event()
         self.plug()
 
@@ -83,7 +84,7 @@ class Device:
                 data = item(0x1060, (self.ticks % 2**32).to_bytes(4, "big"))
                 for kind, _ in self.items:
                     data += item(kind, struct.pack("!fff", *(ACCEL if kind & 0xF000 == 0x4000 else GYRO)))
-                self._write(whole(0x36, data))
+                self._write(self.noise() + whole(0x36, self.packet or data))
             if not self.measuring:
                 due = time.monotonic()
 
@@ -211,56 +212,50 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
 # Frames and packets --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("piece", [1, 7, 5000])
-def test_frames_come_out_of_pieces_and_noise(piece: int) -> None:
-    """Noise with preambles in it, also such that announce a long frame; a wrong checksum; a frame that is cut."""
-    rng = np.random.default_rng(3)
-    contents = [rng.bytes(length) for length in (0, 1, 42, 253, 254)] * 10
-    stream, noise = b"", 0
-    for data in contents:
-        good = whole(0x36, data)
-        between = rng.bytes(9) + good[:-1] + bytes([good[-1] ^ 1]) + b"\xfa\xff\x36\x05"
-        noise += len(between)
-        stream += between + good
-    buffer, frames, skipped = bytearray(), [], 0
-    for k in range(0, len(stream), piece):
-        buffer += stream[k : k + piece]
-        came, lost = mti.take_frames(buffer)
-        frames += came
-        skipped += lost
-    assert frames == [(0x36, data) for data in contents]
-    assert skipped == noise
-    assert mti.build_frame(0x30) == bytes.fromhex("FAFF3000D1")  # as MT Manager sends it
+def test_frames_come_out_of_noise(plugged: Plug) -> None:
+    """With preambles in it, also such that announce a long frame; a wrong checksum; a frame that is cut."""
+    rng, device = np.random.default_rng(3), plugged("one")
+    bad = whole(0x36, bytes(20))
+    device.noise = lambda: rng.bytes(9) + bad[:-1] + bytes([bad[-1] ^ 1]) + b"\xfa\xff\x36\x05"
+    with connected(f"mti:{device.link}=torso@100") as source:
+        torso = collect(source, 50)["torso"]
+        assert len(torso.time) >= 50
+        assert (torso.gyro_S == GYRO).all()
+        assert sum(source.problems.values()) > 0
 
 
-def test_a_packet_of_a_device() -> None:
+def test_a_packet_of_a_device(plugged: Plug) -> None:
     """An MTi-300's bytes and what MT Manager reads in them; orientation, ΔV, ΔQ, magnetic field are passed over."""
-    data = bytes.fromhex(
+    device = plugged("one")
+    device.packet = bytes.fromhex(
         "102002918D10600401363FA62010103F35E0423F31CD15BD9F49DBBDA938CF40200CBD635A90411D08D43E5FAA50"
         "40100CB91168003CC901003A0F7D0040300CBC3B29803C35FC003CA46E0080200C3CAEA241BB56D800BAD5AC01"
         "8030103F80000037DF8801B6898000B608C000C0200CBEFBFBF23F33C485BFA0A2C108100442168000"
         "301004000186E1E0200400400003"
     )
-    packet = mti.parse_packet(data)
-    assert packet is not None
-    time_s, values = packet
-    assert time_s == pytest.approx(2033.2454)
-    expected = (0.02131760, -0.00327826, -0.00163019, -0.05550629, 9.81465530, 0.21842313)
-    assert values == pytest.approx(expected, abs=1e-8)
+    with connected(f"mti:{device.link}=torso@100") as source:
+        torso = collect(source, 1)["torso"]
+    np.testing.assert_allclose(torso.gyro_S[0], [0.02131760, -0.00327826, -0.00163019], atol=1e-8)
+    np.testing.assert_allclose(torso.accel_S[0], [-0.05550629, 9.81465530, 0.21842313], atol=1e-8)
 
 
 VECTORS = struct.pack("!fff", *GYRO), struct.pack("!fff", *ACCEL)
 
 
 @pytest.mark.parametrize(
-    ("data", "is_sample"),
+    "packet",
     [
-        (item(0x1060, bytes(4)) + item(0x8024, VECTORS[0]) + item(0x4024, VECTORS[1]), True),  # NED: of the world
-        (item(0x1060, bytes(4)) + item(0x8021, VECTORS[0]) + item(0x4021, VECTORS[1]), False),  # fixed point
-        (item(0x8020, VECTORS[0]) + item(0x4020, VECTORS[1]), False),  # without a time
-        (item(0x1060, bytes(4)) + item(0x8020, VECTORS[0][:11]) + item(0x4020, VECTORS[1]), False),
-        (b"\x80", False),
+        item(0x1060, bytes(4)) + item(0x8021, VECTORS[0]) + item(0x4021, VECTORS[1]),  # fixed point
+        item(0x8020, VECTORS[0]) + item(0x4020, VECTORS[1]),  # without a time
+        item(0x1060, bytes(4)) + item(0x8020, VECTORS[0][:11]) + item(0x4020, VECTORS[1]),
+        b"\x80",
     ],
 )
-def test_only_a_packet_as_it_was_asked_for_is_a_sample(data: bytes, is_sample: bool) -> None:
-    assert mti.parse_packet(data) == ((0.0, (*GYRO, *ACCEL)) if is_sample else None)
+def test_a_packet_that_was_not_asked_for_is_no_sample(packet: bytes, plugged: Plug) -> None:
+    device = plugged("one")
+    with connected(f"mti:{device.link}=torso@100") as source:
+        collect(source, 5)
+        device.packet = packet
+        wait_until(lambda: source.read(0.05) is not None and source.problems)
+        device.packet = b""
+        assert (collect(source, 5)["torso"].gyro_S == GYRO).all()
