@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wepose_pin.body import load_model
+from wepose_pin import load_model
 from wepose_pin.calibration import load_protocol
 from wepose_pin.live.guide import Demonstration
 from wepose_pin.live.state import GuideView
@@ -15,7 +15,7 @@ def wrist_heights(protocol: str, phase: str) -> np.ndarray:
     """(n,) [m] of the left wrist above the hips, over half a minute of a phase."""
     model = load_model()
     figure = Demonstration(model, load_protocol(protocol))
-    wrist = list(figure._kinematics.points).index("left_wrist")
+    wrist = figure.info.points.index("left_wrist")
     return np.array(
         [figure.pose(GuideView("", demonstration=phase), t).points[wrist, 2] for t in np.arange(0, 30, 0.5)]
     )

@@ -17,10 +17,7 @@ import pytest
 from browser import BROWSER, Browser
 from guided_person import GuidedPerson, UdpPerson, perform
 
-from wepose_pin.body.subject import load_subject
-from wepose_pin.calibration import calibrate
-from wepose_pin.readers import load_session
-from wepose_pin.simulation import simulate_person
+from wepose_pin import calibrate, load_session, load_subject, simulate_person
 
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
 LENGTHS = simulate_person(PERSON[0]).lengths

@@ -15,14 +15,13 @@ import numpy as np
 import polars as pl
 import pytest
 from bodies import LENGTHS, SEGMENTS
+from commands import run as run_command
 from sampling import find_free_port
 from test_causal import first
 
-from wepose_pin.body.subject import mount_rows, population_subject, subject_toml
-from wepose_pin.commands import main
-from wepose_pin.readers import load_session
+from wepose_pin import Simulation, load_session, population_subject
+from wepose_pin.body.subject import mount_rows
 from wepose_pin.readers.live_log import read_live_log
-from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 
 SPEED = 4.0
@@ -37,9 +36,7 @@ def session(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def run(*arguments: str, code: int = 0) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(list(arguments))
-    assert stop.value.code == code
+    assert run_command(*arguments) == code
 
 
 @pytest.mark.kill
@@ -143,7 +140,7 @@ def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
         order=(*LENGTHS, *mount_rows("torso")),
         covariance=1e-4 * np.eye(len(LENGTHS) + 3),
     )
-    (tmp_path / "subject.toml").write_text(subject_toml(subject))
+    subject.save(tmp_path / "subject.toml")
     command = [sys.executable, "-um", "wepose_pin", "live", "--source", f"udp:{find_free_port()}"]
     command += ["--subject", "subject.toml", "--no-page"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
