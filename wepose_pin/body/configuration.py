@@ -12,7 +12,6 @@ follow the limbs.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -22,8 +21,8 @@ from ..compilation import kernel
 from ..errors import BadData, BadModel
 from ..rotations import conjugate, exp, log, multiply, product, rotation_about
 from .body import BodyModel
-from .girdle import displace_one, find_girdle_scale
-from .links import compute_link_poses, find_columns
+from .girdle import follow_law
+from .links import compute_link_poses, describe_girdle, find_columns
 from .table import check_segments
 
 _MEET_TOLERANCE = 1e-6  # [m] between joints of one place
@@ -73,24 +72,20 @@ class ConfigurationSolver:
         if is_mechanism:
             self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
         self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
-        chains = (
-            []
-            if is_mechanism
-            else [_ExactChain(model, name, self.segments, limits) for name in self.segments if model.chains[name].exact]
-        )
+        exact = [name for name in self.segments if model.chains[name].exact and not is_mechanism]
+        chains = [_ExactChain(model, name, self.segments, limits) for name in exact]
         self._bent = [chain for chain in chains if len(chain.joints) > 1]
         spherical = [chain.describe_spherical() for chain in chains if len(chain.joints) == 1]
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
+        girdles = {name: girdle for name, girdle in model.table.girdles.items() if girdle.on in segments}
         self._girdles = [
-            _describe_girdle(model, name, self.segments)
-            for name, girdle in model.table.girdles.items()
-            if girdle.on in self.segments
+            (describe_girdle(model, name, self.segments), np.array([m.idx_qs[m.getJointId(j)] for j in girdle.joints]))
+            for name, girdle in girdles.items()
         ]
 
     def solve(self, quat_WL: np.ndarray) -> np.ndarray:
         """Solve for `q` (n, nq) of orientations (n, k, 4) xyzw; they continue the motion of the last call."""
-        last = self._last
         q = np.empty((len(quat_WL), len(self._neutral)))
         q[:] = self._neutral
         if self._spherical:
@@ -98,10 +93,12 @@ class ConfigurationSolver:
         for chain in self._bent:
             chain.bend(q, quat_WL)
         if self._fit is not None:
-            self._fit.run(q, quat_WL, last)
-        for girdle in self._girdles:
-            _place_girdle(quat_WL, *girdle, q)
-        _unwrap_signs(q, self._quaternions, q[0] if last is None else last)
+            self._fit.run(q, quat_WL, self._last)
+        for girdle, at in self._girdles:
+            motion = np.empty((len(q), 7))
+            follow_law(quat_WL, *girdle, motion)
+            q[:, at] = motion[:, :3]
+        _unwrap_signs(q, self._quaternions, q[0] if self._last is None else self._last)
         self._last = q[-1].copy()
         return q
 
@@ -149,10 +146,8 @@ class _ExactChain:
         self.joints = []  # place in q, R_AJ, axis in A (None: spherical) and limits, from the root outwards
         for joint in joints:
             R_AJ, at = Rotation.from_matrix(R_AW @ data.oMi[joint].rotation), m.idx_qs[joint]
-            axis, ends = None, (-np.inf, np.inf)
-            if m.nqs[joint] == 1:
-                axis = R_AJ.apply(m.joints[joint].extract().axis)
-                ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else ends
+            axis = R_AJ.apply(m.joints[joint].extract().axis) if m.nqs[joint] == 1 else None
+            ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else (-np.inf, np.inf)
             self.joints.append((at, R_AJ, axis, ends))
 
     def describe_spherical(self) -> tuple[int, int, np.ndarray, np.ndarray, int]:
@@ -227,25 +222,25 @@ class _Fit:
     def __init__(
         self, body: BodyModel, links: Sequence[str], segments: Sequence[str], joints: Sequence[int], limits: bool
     ) -> None:
-        model, is_mechanism = body.pin, body.table.is_mechanism
+        m = body.pin
         self._rows = [segments.index(link) for link in links]
-        self._model, self._data = model, model.createData()
-        frames = [model.frames[model.getFrameId(link)] for link in links]
+        self._model, self._data = m, m.createData()
+        frames = [m.frames[m.getFrameId(link)] for link in links]
         # The joint's frame is compared in place of the link's, which is fixed to it: its rotation comes for nothing.
         self._R_LJ = np.array([frame.placement.rotation.T for frame in frames])
         self._views = [self._data.oMi[frame.parentJoint].rotation for frame in frames]
-        self._columns = find_columns(model, joints)
-        moves = np.zeros((len(links), model.nv), dtype=bool)
+        self._columns = find_columns(m, joints)
+        moves = np.zeros((len(links), m.nv), dtype=bool)
         for k, frame in enumerate(frames):
-            moves[k, find_columns(model, model.supports[frame.parentJoint].tolist()[1:])] = True
+            moves[k, find_columns(m, m.supports[frame.parentJoint].tolist()[1:])] = True
         self._pull = moves[:, self._columns].astype(float).T  # (f, m): which links a column turns
         self._both = self._pull @ self._pull.T  # (f, f): how many links two columns both turn
-        begin = [j for j in joints if is_mechanism or model.nqs[j] == 1]  # where they were in the frame before
-        self._places = np.array([model.idx_qs[j] + k for j in begin for k in range(model.nqs[j])], dtype=int)
-        bounded = [j for j in joints if model.nqs[j] == 1] if limits else []
-        self._at = np.array([model.idx_qs[joint] for joint in bounded], dtype=int)
-        self._lower, self._upper = model.lowerPositionLimit[self._at], model.upperPositionLimit[self._at]
-        self._bounded = np.searchsorted(self._columns, find_columns(model, bounded))
+        begin = [j for j in joints if body.table.is_mechanism or m.nqs[j] == 1]  # where they were in the frame before
+        self._places = np.array([m.idx_qs[j] + k for j in begin for k in range(m.nqs[j])], dtype=int)
+        bounded = [j for j in joints if m.nqs[j] == 1] if limits else []
+        self._at = np.array([m.idx_qs[joint] for joint in bounded], dtype=int)
+        self._lower, self._upper = m.lowerPositionLimit[self._at], m.upperPositionLimit[self._at]
+        self._bounded = np.searchsorted(self._columns, find_columns(m, bounded))
 
     def run(self, q: np.ndarray, quat_WL: np.ndarray, last: np.ndarray | None) -> None:
         """Write the joints that may move into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw and the `last` frame (nq,)."""
@@ -277,18 +272,17 @@ class _Fit:
             free[self._bounded] = ~((value <= self._lower) & (push < 0.0) | (value >= self._upper) & (push > 0.0))
             rows = np.flatnonzero(free)
             H = ((J.T @ J) * self._both)[np.ix_(rows, rows)]
-            while True:
+            less = np.inf
+            while less > left and damping <= _MOST_DAMPING:
                 step[:] = 0.0
                 step[self._columns[rows]] = np.linalg.solve(H + damping * np.eye(len(rows)), g[rows])
                 tried = self._keep_limits(pin.integrate(self._model, q, step))
                 less, new = self._compare(tried, R_target)
-                if less <= left or damping >= _MOST_DAMPING:
-                    break
                 damping *= 10.0
             if less > left:
                 break
             q, left, e = tried, less, new
-            damping = max(_DAMPING, 0.1 * damping)
+            damping = max(_DAMPING, 0.01 * damping)
             if np.abs(step).max() < _STEP:
                 break
         return q
@@ -308,32 +302,3 @@ def compute_orientation_residuals(
         segment: (Rotation.from_matrix(R_WL[:, k]).inv() * Rotation.from_quat(quat_WL[segment])).magnitude()
         for k, segment in enumerate(limited)
     }
-
-
-# Girdles ----------------------------------------------------------------------------------------------------------
-
-
-def _describe_girdle(model: BodyModel, name: str, segments: Sequence[str]) -> tuple[Any, ...]:
-    girdle, m = model.table.girdles[name], model.pin
-    moves = segments.index(girdle.moves) if girdle.moves in segments else -1
-    along, at = model.table.segments[girdle.moves].along, [m.idx_qs[m.getJointId(joint)] for joint in girdle.joints]
-    law = girdle.law, find_girdle_scale(girdle, model.lengths), model.girdle_parameters(name)
-    return segments.index(girdle.on), moves, np.array(along), *law, np.array(at)
-
-
-@kernel
-def _place_girdle(quat, on, moves, along, law, scale, parameters, at, q):  # type: ignore[no-untyped-def]
-    """Write a girdle's joints at `at` (3,) into `q` (n, nq), as `move_girdles`; without `moves`, -1, at rest."""
-    for i in range(len(quat)):
-        dx, dy, dz, s = 0.0, 0.0, 0.0, 0.0
-        if moves >= 0:
-            a, b = quat[i, on], quat[i, moves]
-            x, y, z, w = product(-a[0], -a[1], -a[2], a[3], b[0], b[1], b[2], b[3])
-            tx, ty, tz, tw = product(x, y, z, w, along[0], along[1], along[2], 0.0)
-            rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
-            norm = x * x + y * y + z * z + w * w
-            dx, dy, dz, s = displace_one(law, rx / norm, ry / norm, rz / norm, scale)
-        share = 1.0 + parameters[0]
-        q[i, at[0]] = share * dx + parameters[1] + s * parameters[4]
-        q[i, at[1]] = share * dy + parameters[2] + s * parameters[5]
-        q[i, at[2]] = share * dz + parameters[3] + s * parameters[6]

@@ -18,9 +18,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..compilation import inlined
+from ..compilation import inlined, kernel
 from ..documents import Key
 from ..recording.sensors import AXES
+from ..rotations import product
 
 MAX_ELEVATION = np.deg2rad(130.0)  # [rad] up to which the law holds; it stays there beyond
 # Of a person: a share of the law, then [m].
@@ -61,6 +62,10 @@ class Girdle(NamedTuple):
         """(10,) the numbers of the law: `outward`, `up`, `middle`, `back`, `back_angle`."""
         return (*self.outward, *self.up, *self.middle, *self.back, self.back_angle)
 
+    def find_scale(self, lengths: Mapping[str, float]) -> float:
+        """Return the law's scale for a body of these lengths [m]."""
+        return lengths[self.scaled_by] / self.scale if self.scaled_by in lengths else 1.0
+
 
 def _make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
     """Make the law of these functions: displacement x, y, z [m] and s, by `Girdle.law`, a direction and the scale."""
@@ -76,7 +81,7 @@ def _make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
     return law
 
 
-displace_one = inlined(_make_law(math.sqrt, math.atan2, min, math.exp))
+_displace_one = inlined(_make_law(math.sqrt, math.atan2, min, math.exp))
 
 
 def displace(girdle: Girdle, along: Any, scale: Any, functions: Any) -> tuple[tuple[Any, Any, Any], Any]:
@@ -92,9 +97,26 @@ def displace(girdle: Girdle, along: Any, scale: Any, functions: Any) -> tuple[tu
     return (x, y, z), s
 
 
-def find_girdle_scale(girdle: Girdle, lengths: Mapping[str, float]) -> float:
-    """The law's scale for a body of these lengths [m]."""
-    return lengths[girdle.scaled_by] / girdle.scale if girdle.scaled_by in lengths else 1.0
+@kernel
+def follow_law(quat, on, moves, along, law, scale, own, out):  # type: ignore[no-untyped-def]
+    """Write a girdle's displacement (3,) [m], that of the law alone (3,) and s into `out` (n, 7).
+
+    `quat` (n, k, 4) xyzw has the segments in the columns `on` and `moves`; without it, -1, the girdle is at rest.
+    `along`, `own` : (3,) the limb in its segment, (7,) what the person differs by
+    """
+    for i in range(len(quat)):
+        dx, dy, dz, s = 0.0, 0.0, 0.0, 0.0
+        if moves >= 0:
+            a, b = quat[i, on], quat[i, moves]
+            x, y, z, w = product(-a[0], -a[1], -a[2], a[3], b[0], b[1], b[2], b[3])
+            tx, ty, tz, tw = product(x, y, z, w, along[0], along[1], along[2], 0.0)
+            rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
+            norm = x * x + y * y + z * z + w * w
+            dx, dy, dz, s = _displace_one(law, rx / norm, ry / norm, rz / norm, scale)
+        out[i, 0] = (1.0 + own[0]) * dx + own[1] + s * own[4]
+        out[i, 1] = (1.0 + own[0]) * dy + own[2] + s * own[5]
+        out[i, 2] = (1.0 + own[0]) * dz + own[3] + s * own[6]
+        out[i, 3], out[i, 4], out[i, 5], out[i, 6] = dx, dy, dz, s
 
 
 class GirdleMotion(NamedTuple):

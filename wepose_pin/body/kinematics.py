@@ -21,7 +21,8 @@ from .links import compute_axis_std, compute_joint_values, compute_link_poses, f
 
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
 MAX_TABLE_NORM_DEVIATION = 1e-2  # the same in a table: a file may have few decimals
-# Of a covariance in a table.
+# Columns of a quaternion, a position and a covariance in a table.
+_QUAT, _XYZ = ("qx", "qy", "qz", "qw"), ("x", "y", "z")
 _ENTRIES = {f"cov_{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
 
 
@@ -132,8 +133,8 @@ def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
     """
     table = {"time": pose.time}
     for series, components, covariances in (
-        (pose.quat_WL, ("qx", "qy", "qz", "qw"), pose.segment_cov),
-        (pose.points, ("x", "y", "z"), pose.point_cov),
+        (pose.quat_WL, _QUAT, pose.segment_cov),
+        (pose.points, _XYZ, pose.point_cov),
     ):
         for name, values in series.items():
             table |= {f"{name}_{component}": values[:, k] for k, component in enumerate(components)}
@@ -167,13 +168,10 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
         """Collect name → its columns (n, k), where all of them are there."""
         names = [name.removesuffix(f"_{components[0]}") for name in numbers if name.endswith(f"_{components[0]}")]
         columns = {name: [f"{name}_{component}" for component in components] for name in names}
-        return {
-            name: np.column_stack([numbers[column] for column in own])
-            for name, own in columns.items()
-            if set(own) <= set(numbers)
-        }
+        complete = {name: own for name, own in columns.items() if set(own) <= set(numbers)}
+        return {name: np.column_stack([numbers[column] for column in own]) for name, own in complete.items()}
 
-    quat_WL, points = collect("qx", "qy", "qz", "qw"), collect("x", "y", "z")
+    quat_WL, points = collect(*_QUAT), collect(*_XYZ)
     for name, quat in quat_WL.items():
         norm = np.linalg.norm(quat, axis=1)
         if np.any(np.abs(norm - 1.0) > MAX_TABLE_NORM_DEVIATION):
@@ -186,14 +184,11 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
         cov = covariances[name] = np.empty((len(time), 3, 3))
         for column, (i, j) in zip(entries.T, _ENTRIES.values(), strict=True):
             cov[:, i, j] = cov[:, j, i] = column
-    return Pose(
-        time,
-        quat_WL,
-        points,
-        segment_cov={name: covariances[name] for name in quat_WL if name in covariances},
-        point_cov={name: covariances[name] for name in points if name in covariances},
-        gap={name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers},
+    segment_cov, point_cov = (
+        {name: covariances[name] for name in series if name in covariances} for series in (quat_WL, points)
     )
+    gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
+    return Pose(time, quat_WL, points, segment_cov=segment_cov, point_cov=point_cov, gap=gap)
 
 
 # From orientations --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadModel
 from ..rotations import unwrap_signs
 from .body import BodyModel
-from .girdle import MEAN_RAISED, PARAMETERS, GirdleMotion, displace, find_girdle_scale
+from .girdle import MEAN_RAISED, PARAMETERS, GirdleMotion, follow_law
 from .lengths import UNIVERSE
 
 _DETERMINED = 1e-9  # [m/rad or rad/rad] by which open motions may move what is determined: rounding
@@ -50,35 +50,27 @@ def compute_link_placements(
     return {link: (unwrap_signs(quat[:, k]), p[:, k]) for k, link in enumerate(links)}
 
 
-def move_girdles(
-    model: BodyModel, R_WL: Mapping[str, np.ndarray], names: Iterable[str] | None = None
-) -> dict[str, GirdleMotion]:
-    """Compute girdle → its motion, of those that hang on a measured segment.
+def describe_girdle(model: BodyModel, name: str, segments: Sequence[str]) -> tuple[Any, ...]:
+    """Return what `follow_law` needs of a girdle, from `on` to `own`, with orientations of these segments."""
+    girdle = model.table.girdles[name]
+    moves = segments.index(girdle.moves) if girdle.moves in segments else -1
+    along = np.array(model.table.segments[girdle.moves].along)
+    scale, own = girdle.find_scale(model.lengths), model.girdle_parameters(name)
+    return segments.index(girdle.on), moves, along, girdle.law, scale, own
 
-    Parameters
-    ----------
-    R_WL : segment → orientations (n, 3, 3)
-    names : of girdles; None: all of the body
-    """
-    motions = {}
+
+def move_girdles(
+    model: BodyModel, quat_WL: Mapping[str, np.ndarray], names: Iterable[str] | None = None
+) -> dict[str, GirdleMotion]:
+    """Compute girdle → its motion, of those `names`, or of all, that hang on a segment of `quat_WL` (n, 4) xyzw."""
+    motions, quat = {}, np.stack(list(quat_WL.values()), axis=1)
     for name in model.table.girdles if names is None else names:
-        girdle, parameters = model.table.girdles[name], model.girdle_parameters(name)
-        if girdle.on not in R_WL:
-            continue
-        n = len(R_WL[girdle.on])
-        if girdle.moves not in R_WL:
-            raised = np.full(n, MEAN_RAISED)
-            motions[name] = GirdleMotion(np.tile(parameters[1:4], (n, 1)), np.zeros((n, 3)), raised, False)
-            continue
-        # Sums of columns: a product of matrices may have other last bits for one orientation than for many.
-        x, y, z = model.table.segments[girdle.moves].along
-        columns = R_WL[girdle.moves].transpose(2, 1, 0)
-        along_W = x * columns[0] + y * columns[1] + z * columns[2]
-        along = sum(rows * part for rows, part in zip(R_WL[girdle.on].transpose(1, 2, 0), along_W, strict=True))
-        law, s = displace(girdle, along, find_girdle_scale(girdle, model.lengths), np)
-        by_law = np.column_stack(law)
-        displacement = (1.0 + parameters[0]) * by_law + parameters[1:4] + s[:, None] * parameters[4:]
-        motions[name] = GirdleMotion(displacement, by_law, np.asarray(s), True)
+        girdle = model.table.girdles[name]
+        if girdle.on in quat_WL:
+            motion, is_known = np.empty((len(quat), 7)), girdle.moves in quat_WL
+            follow_law(quat, *describe_girdle(model, name, list(quat_WL)), motion)
+            raised = motion[:, 6] if is_known else np.full(len(quat), MEAN_RAISED)
+            motions[name] = GirdleMotion(motion[:, :3], motion[:, 3:6], raised, is_known)
     return motions
 
 
@@ -96,9 +88,8 @@ def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str 
 
 def find_known_points(model: BodyModel, segments: Iterable[str]) -> list[str]:
     """Find the points that follow from the measured segments: those that no open motion moves."""
-    points = model.point_frames
-    moved = _find_open_motions(model, list(segments), list(points.values()))[1][:, :3]
-    return [point for point, J in zip(points, moved, strict=True) if not np.any(np.abs(J) > _DETERMINED)]
+    moved = _find_open_motions(model, list(segments), list(model.point_frames.values()))[1][:, :3]
+    return [point for point, J in zip(model.point_frames, moved, strict=True) if not np.any(np.abs(J) > _DETERMINED)]
 
 
 def find_known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
@@ -130,16 +121,11 @@ def _find_open_motions(
     """
     m, rng, free = model.pin, np.random.default_rng(0), set(range(1, model.pin.njoints))
     if not model.table.is_mechanism:
-        chains = {
-            name: chain
-            for name, chain in model.chains.items()
-            if name in segments or not model.table.segments[name].rigid_without_sensor
-        }
         free = {
-            j
-            for name, chain in chains.items()
-            for j in chain.joints
-            if name not in segments or chain.spherical in (None, j)
+            joint
+            for name, chain in model.chains.items()
+            for joint in chain.joints
+            if (chain.spherical in (None, joint) if name in segments else name in model.table.needed)
         }
     columns = find_columns(m, sorted(free))
     q = pin.integrate(m, pin.neutral(m), rng.uniform(0.2, 0.9, m.nv) * rng.choice([-1.0, 1.0], m.nv))
@@ -148,13 +134,13 @@ def _find_open_motions(
     pin.updateFramePlacements(m, data)
 
     def compute_jacobians(names: Sequence[str]) -> np.ndarray:
-        frames = [m.getFrameId(name) for name in names]
-        J = [pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED) for frame in frames]
-        return np.reshape(J, (len(frames), 6, m.nv))[:, :, columns]
+        J = [pin.getFrameJacobian(m, data, m.getFrameId(name), pin.LOCAL_WORLD_ALIGNED) for name in names]
+        return np.reshape(J, (len(names), 6, m.nv))[:, :, columns]
 
     _, s, Vt = np.linalg.svd(compute_jacobians(segments)[:, 3:].reshape(3 * len(segments), -1))
-    open_motions = np.zeros((m.nv, len(columns) - np.count_nonzero(s > _SINGULAR)))
-    open_motions[columns] = Vt[np.count_nonzero(s > _SINGULAR) :].T
+    rank = np.count_nonzero(s > _SINGULAR)
+    open_motions = np.zeros((m.nv, len(columns) - rank))
+    open_motions[columns] = Vt[rank:].T
     return open_motions, compute_jacobians(links) @ open_motions[columns]
 
 
@@ -202,40 +188,30 @@ def compute_point_covariances(
             return {}
         return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov)
     covariances: dict[str, np.ndarray] = {}
-    rotated: dict[tuple[int, ...], np.ndarray] = {}  # what points of a limb share is computed once
     for point, parts in _find_ways(model, quat_WL, points).items():
-        own: dict[str, list[_Part]] = {}  # segment → the parts that rotate with it
+        vectors: dict[str, np.ndarray] = {}  # segment → the sum of what rotates with it
         for part in parts:
             if part.segment is not None:
-                own.setdefault(part.segment, []).append(part)
-        if not parts or not set(own) <= set(segment_cov):
+                vectors[part.segment] = vectors.get(part.segment, 0.0) + part.vector
+        if not parts or not set(vectors) <= set(segment_cov):
             continue
         columns = [column for part in parts for column in part.columns]
         J = np.concatenate([part.jacobian for part in parts], axis=2)
         # Sample by sample: the bits of one large product would depend on the number of samples.
         cov = J @ shape_cov[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
-        vectors = {segment: np.sum([part.vector for part in each], axis=0) for segment, each in own.items()}
         for segment, vector in vectors.items():
-            key = tuple(id(part) for part in own[segment])
-            if key not in rotated:
-                skew = np.zeros((len(vector), 3, 3))  # [v]×
-                skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
-                skew = skew - skew.swapaxes(1, 2)
-                rotated[key] = skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
-            cov += rotated[key]
+            skew = np.zeros((len(vector), 3, 3))  # [v]×
+            skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
+            skew = skew - skew.swapaxes(1, 2)
+            cov += skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
         for part in parts:
-            if part.residual is not None:
-                cov += part.residual
+            cov += part.residual
         for (near, far), shared in heading_cov.items():
             if near in vectors and far in vectors:
                 # A heading error ε moves the end of a vector by ε e_z × v.
-                x, y, _ = vectors[near].T
-                u, v, _ = vectors[far].T
-                cross = -shared * (x * v + y * u)
-                cov[:, 0, 0] += 2.0 * shared * y * v
-                cov[:, 1, 1] += 2.0 * shared * x * u
-                cov[:, 0, 1] += cross
-                cov[:, 1, 0] += cross
+                a, b = (np.stack([-vectors[name][:, 1], vectors[name][:, 0]], axis=1) for name in (near, far))
+                outer = shared[:, None, None] * a[:, :, None] * b[:, None, :]
+                cov[:, :2, :2] += outer + outer.swapaxes(1, 2)
         covariances[point] = cov
     return covariances
 
@@ -247,7 +223,7 @@ class _Part(NamedTuple):
     vector: np.ndarray  # (n, 3) [m] in W
     columns: Sequence[int]  # of the shape's parameters that change it
     jacobian: np.ndarray  # (n, 3, c) of the vector by these
-    residual: np.ndarray | None = None  # (n, 3, 3) [m²] in W by which it leaves what the shape says
+    residual: np.ndarray | float = 0.0  # (n, 3, 3) [m²] in W by which it leaves what the shape says
 
 
 def _find_ways(
@@ -257,30 +233,35 @@ def _find_ways(
     R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
     lengths, neutral = np.array(list(model.lengths.values())), model.neutral_rotations
     n = len(next(iter(quat_WL.values())))
-    known: dict[Any, _Part] = {}
-    for name, motion in move_girdles(model, R_WL).items():
-        girdle = model.table.girdles[name]
-        first = len(lengths) + len(PARAMETERS) * list(model.table.girdles).index(name)
+    known: dict[Any, _Part | None] = {}
+    for name, motion in move_girdles(model, quat_WL).items():
+        girdle, size = model.table.girdles[name], len(PARAMETERS)
+        first = len(lengths) + size * list(model.table.girdles).index(name)
         R_on = R_WL[girdle.on]
         residual = (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
         vector = np.einsum("nij,nj->ni", R_on, motion.displacement)
-        known[name] = _Part(girdle.on, vector, range(first, first + len(PARAMETERS)), R_on @ motion.jacobian, residual)
+        known[name] = _Part(girdle.on, vector, range(first, first + size), R_on @ motion.jacobian, residual)
+
+    def find_part(link: str, by_length: np.ndarray, constant: np.ndarray) -> _Part | None:
+        carrier = None if link == UNIVERSE else find_carrier(model, link, R_WL)
+        if carrier is None and link != UNIVERSE:
+            return None
+        R_WK = np.broadcast_to(np.eye(3), (n, 3, 3)) if carrier is None else R_WL[carrier]
+        if carrier is not None and carrier != link:
+            R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
+        columns = np.flatnonzero(by_length.any(axis=0)).tolist()
+        return _Part(carrier, R_WK @ (by_length @ lengths + constant), columns, R_WK @ by_length[:, columns])
+
     ways: dict[str, tuple[_Part, ...]] = {}
     for point in points:
-        keys: list[Any] = []
-        for link, (by_length, constant) in model.reaches[point].items():
-            keys.append((link, by_length.tobytes(), constant.tobytes()))
-            carrier = None if link == UNIVERSE else find_carrier(model, link, R_WL)
-            if keys[-1] in known or (carrier is None and link != UNIVERSE):
-                continue
-            R_WK = np.broadcast_to(np.eye(3), (n, 3, 3)) if carrier is None else R_WL[carrier]
-            if carrier is not None and carrier != link:
-                R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
-            columns = np.flatnonzero(by_length.any(axis=0)).tolist()
-            vector = R_WK @ (by_length @ lengths + constant)
-            known[keys[-1]] = _Part(carrier, vector, columns, R_WK @ by_length[:, columns])
-        keys += model.point_girdles[point]
-        ways[point] = tuple(known[key] for key in keys) if set(keys) <= set(known) else ()
+        parts = []
+        for link, vector in model.reaches[point].items():
+            key = (link, *(each.tobytes() for each in vector))  # points of a limb share parts
+            known[key] = known[key] if key in known else find_part(link, *vector)
+            parts.append(known[key])
+        parts += [known.get(name) for name in model.point_girdles[point]]
+        own = tuple(part for part in parts if part is not None)
+        ways[point] = own if len(own) == len(parts) else ()
     return ways
 
 
@@ -293,22 +274,22 @@ def _propagate_through_joints(
     heading_cov: Mapping[tuple[str, str], np.ndarray],
 ) -> dict[str, np.ndarray]:
     """Compute the covariances of a mechanism's points: errors δ of the orientations are errors J⁺ δ of the joints."""
-    m, data, k = model.pin, model.pin.createData(), len(segment_cov)
-    segments = [m.getFrameId(segment) for segment in segment_cov]
+    m, data, order = model.pin, model.pin.createData(), list(segment_cov)
+    segments, k = [m.getFrameId(segment) for segment in order], len(order)
     frames = [m.getFrameId(model.point_frames[point]) for point in points]
     cov_W = np.stack(list(segment_cov.values()), axis=1)  # (n, k, 3, 3)
-    shared, order = np.zeros((len(q), k, k)), list(segment_cov)
+    shared = np.zeros((len(q), k, k))
     for (near, far), cov in heading_cov.items():
         shared[:, order.index(near), order.index(far)] = shared[:, order.index(far), order.index(near)] = cov
-    ways: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in points]  # views of R_WK, by the lengths
     try:
         reaches = model.reaches if lengths_cov.any() else {}
     except BadModel:  # a joint slides: the way of a point has no constant parts link by link
         return {}
+    ways: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in points]  # views of R_WK, by the lengths
     for way, point in zip(ways, points, strict=True):
-        for link, part in reaches.get(point, {}).items():
+        for link, (by_length, _) in reaches.get(point, {}).items():
             frame = data.oMf[m.getFrameId(link)] if m.existFrame(link) else data.oMi[m.getJointId(link)]
-            way.append((frame.rotation, part.by_length))
+            way.append((frame.rotation, by_length))
     out = np.empty((len(points), len(q), 3, 3))
     for row, values in enumerate(np.ascontiguousarray(q)):
         pin.computeJointJacobians(m, data, values)
@@ -318,11 +299,10 @@ def _propagate_through_joints(
         for i, frame in enumerate(frames):
             gain = pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3] @ inverse  # (3, 3 k)
             parts = gain.reshape(3, k, 3).swapaxes(0, 1)
+            along = np.sum([R_WK @ by_length for R_WK, by_length in ways[i]], axis=0) if ways[i] else np.zeros((3, 0))
             out[i, row] = np.sum(parts @ cov_W[row] @ parts.swapaxes(1, 2), axis=0)
             out[i, row] += parts[:, :, 2].T @ shared[row] @ parts[:, :, 2]
-            if ways[i]:
-                along = np.sum([R_WK @ by_length for R_WK, by_length in ways[i]], axis=0)
-                out[i, row] += along @ lengths_cov @ along.T
+            out[i, row] += along @ lengths_cov[: along.shape[1], : along.shape[1]] @ along.T
     return dict(zip(points, out, strict=True))
 
 

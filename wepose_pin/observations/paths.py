@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ..body import BodyModel, Girdle
-from ..body.girdle import PARAMETERS, displace, find_girdle_scale
+from ..body.girdle import PARAMETERS, displace
 from ..body.lengths import UNIVERSE
 from ..body.links import find_carrier
 from ..body.mounts import StartPose
@@ -155,7 +155,7 @@ def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -
         if {girdle.on, girdle.moves} <= set(sensors):
             along = start.turn(girdle.moves, model.table.segments[girdle.moves].along)
             R_on = tuple(float(v) for v in start.rotation(girdle.on).ravel())
-            terms.append(GirdleTerm(name, girdle, along, R_on, find_girdle_scale(girdle, model.lengths)))
+            terms.append(GirdleTerm(name, girdle, along, R_on, girdle.find_scale(model.lengths)))
     return tuple(terms)
 
 

@@ -139,7 +139,7 @@ def _compute_root_position(motion: Motion, root: Bone) -> np.ndarray:
     at_rest = []
     for point in anchors:
         moved = np.zeros((len(pose.time), 3))
-        for name, girdle in move_girdles(model, R_WL, model.point_girdles[point]).items():
+        for name, girdle in move_girdles(model, pose.quat_WL, model.point_girdles[point]).items():
             displacement = girdle.displacement - model.girdle_parameters(name)[1:4]
             moved += np.einsum("nij,nj->ni", R_WL[model.table.girdles[name].on], displacement)
         at_rest.append(pose.points[point] - moved)
