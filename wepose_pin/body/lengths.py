@@ -7,6 +7,7 @@ what they add is in `girdle`.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import pinocchio as pin
 
 from ..errors import BadModel
 from .table import ROOT, BodyTable
-from .tree import Tree, copy_robot, joint_placement, parse_tree
+from .tree import Tree, joint_placement, parse_tree
 
 UNIVERSE = "universe"  # the link of what is rigid with the root
 _TOLERANCE = 1e-9  # [m] by which a length may miss what it is set to
@@ -33,7 +34,7 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
 
     A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
     """
-    robot = copy_robot(robot)
+    robot = pickle.loads(pickle.dumps(robot, pickle.HIGHEST_PROTOCOL))  # several times as fast as `copy.deepcopy`
     tree = parse_tree(robot, robot.name)
     own, projections = measure_lengths(robot, table), _find_projections(tree, table)
     ratio = {name: value / own[name] for name, value in targets.items()}

@@ -64,7 +64,7 @@ class StartPose:
 
     def turn(self, link: str, vector: Collection[float]) -> Vector:
         """Return a vector (3,) of a link's frame, in L'."""
-        x, y, z = self.R_WK[link] @ np.array(vector) if link in self.R_WK else vector
+        x, y, z = self.rotation(link) @ np.array(vector)
         return float(x), float(y), float(z)
 
     def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
@@ -160,11 +160,10 @@ def find_nominal_mount(
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     sensor = recording.sensors[segment]
-    stated = sensor.stated_quat_LS
-    if stated is None:
+    if sensor.stated_quat_LS is None:
         is_own = isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted)
         return np.array([0.0, 0.0, 0.0, 1.0]) if is_own else None
-    return start_pose.to_segment(segment, Rotation.from_quat(stated)).as_quat() if start_pose.R_WK else stated
+    return start_pose.to_segment(segment, Rotation.from_quat(sensor.stated_quat_LS)).as_quat()
 
 
 def find_mount_covariance(
@@ -172,8 +171,8 @@ def find_mount_covariance(
 ) -> np.ndarray | None:
     """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L', in the N-pose L; None: not known."""
     cov = None if subject is None or recording.remounted else subject.mount_covariance(segment)
-    R = start_pose.R_WK.get(segment)
-    return cov if cov is None or R is None else R @ cov @ R.T
+    R = start_pose.rotation(segment)
+    return None if cov is None else R @ cov @ R.T
 
 
 def compute_start_heading_var(
@@ -223,14 +222,13 @@ def align_sensors(
     nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
     mounts: dict[str, Rotation] = {}
     heading_offsets: dict[str, float] = {}
+    # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
-    if aligned:
-        # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
-        R_WL_start = start_pose.to_world(aligned[0], Rotation.identity())
-        aligned_heading_offset = compute_heading_offset(R_VS_start[aligned[0]], R_WL_start)
     for segment, R_VS in R_VS_start.items():
         if segment in aligned:
-            mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
+            R_WL_start = start_pose.to_world(aligned[0], Rotation.identity())
+            mounts[segment] = Rotation.identity()
+            heading_offsets[segment] = compute_heading_offset(R_VS_start[aligned[0]], R_WL_start)
             continue
         R_WS_nominal = start_pose.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
         psi = compute_heading_offset(R_VS, R_WS_nominal)
@@ -253,10 +251,10 @@ def align_sensors(
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - subject.start_pose_offset[segment].tilt
                 misfit_cov = np.diag(start_pose.std(segment, again=True)[:2] ** 2)
-            squared_stds = float(misfit @ np.linalg.solve(misfit_cov, misfit))
-            if squared_stds > MOUNT_MOVED_STDS**2:
+            stds = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5
+            if stds > MOUNT_MOVED_STDS:
                 value = float(np.linalg.norm(misfit))
-                limit = value * MOUNT_MOVED_STDS / squared_stds**0.5  # [rad] in the direction of the misfit
+                limit = value * MOUNT_MOVED_STDS / stds  # [rad] in the direction of the misfit
                 facts: dict[str, float | str] = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
                 diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
         mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi

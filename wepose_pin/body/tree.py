@@ -6,10 +6,10 @@ reader of the URDF that comes out finds the segments by their names.
 
 from __future__ import annotations
 
-import pickle
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +39,7 @@ class Tree(NamedTuple):
     below: Mapping[str, list[Any]]  # link → joints that hang on it
 
     def path(self, link: str) -> list[Any]:
-        """Joints from the root down to `link`."""
+        """Return the joints from the root down to `link`."""
         joints: list[Any] = []
         while link != self.root:
             joints.append(self.above[link])
@@ -47,34 +47,31 @@ class Tree(NamedTuple):
         return joints[::-1]
 
     def body(self, link: str) -> str:
-        """The uppermost link that is rigid with `link`."""
+        """Return the uppermost link that is rigid with `link`."""
         while link != self.root and self.above[link].type == "fixed":
             link = self.above[link].parent
         return link
 
     def neutral(self, link: str) -> np.ndarray:
-        """Placement (4, 4) of `link` in the root link, all joints at zero."""
-        M = np.eye(4)
-        for joint in self.path(link):
-            M = M @ joint_placement(joint)
-        return M
+        """Return the placement (4, 4) of `link` in the root link, all joints at zero."""
+        return reduce(np.matmul, map(joint_placement, self.path(link)), np.eye(4))
 
     def hanging(self, start: str, others: Collection[str] = ()) -> list[str]:
-        """`start` and the links below it, without the links `others` and what is below them."""
+        """Return `start` and the links below it, without the links `others` and what is below them."""
         links, to_do = [], [start]
         while to_do:
             links.append(link := to_do.pop())
             to_do += [joint.child for joint in self.below[link] if joint.child not in others]
         return links
 
-
-def copy_robot(robot: Any) -> Any:
-    """A deep copy of `robot` (yourdfpy), by pickle: several times as fast as `copy.deepcopy`."""
-    return pickle.loads(pickle.dumps(robot, pickle.HIGHEST_PROTOCOL))
+    def find_above(self, link: str, names: Mapping[str, str]) -> str | None:
+        """Find the name of the nearest link between `link` and the root that has one in `names`."""
+        above = [names[joint.parent] for joint in self.path(link) if joint.parent in names]
+        return above[-1] if above else None
 
 
 def parse_tree(robot: Any, where: str) -> Tree:
-    """The tree that the joints of `robot` (yourdfpy) form."""
+    """Parse the tree that the joints of `robot` (yourdfpy) form."""
     for items in (robot.links, robot.joints):
         name, times = next(iter(Counter(item.name for item in items).most_common(1)), ("", 0))
         if times > 1:
@@ -126,46 +123,45 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
 
     segment_of = {segment.link: name for name, segment in reversed(list(table.segments.items()))}
     R_WL: dict[str, np.ndarray] = {}  # orientation of our segments while their joints are at zero
-    frames: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # name → their link, R_WL, p_W
     for name in sorted(table.segments, key=lambda name: len(tree.path(table.segments[name].link))):
-        above = _segment_above(tree, table.segments[name].link, segment_of)
+        above = tree.find_above(table.segments[name].link, segment_of)
         R_WL[name] = _neutral_orientation(table, name, M_WK, p_W, np.eye(3) if above is None else R_WL[above])
-    for name, segment in table.segments.items():
-        frames[name] = segment.link, R_WL[name], M_WK[segment.link][:3, 3]
+    # Name → their link, and the placement in W.
+    frames = {name: (each.link, R_WL[name], M_WK[each.link][:3, 3]) for name, each in table.segments.items()}
     points: dict[str, Point] = {}
     for name, point in table.points.items():
         begins = None if any(point.at) else segment_of.get(point.link)
         points[name] = Point(begins or name)
         if begins is None and (point.link != name or any(point.at)):  # else the link is there already
-            carrier = segment_of.get(point.link) or _segment_above(tree, point.link, segment_of)
+            carrier = segment_of.get(point.link) or tree.find_above(point.link, segment_of)
             link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
             frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
     segments = {name: segment._replace(link=name, up=None, forward=None) for name, segment in table.segments.items()}
     named = replace(table, segments=segments, points=points, up="+z", forward="+x", root=())
-    return _with_links(robot, tree.root, M_WM, M_WK, frames), named
 
-
-def _segment_above(tree: Tree, link: str, segment_of: Mapping[str, str]) -> str | None:
-    """The nearest segment between a link and the root."""
-    above = [segment_of[joint.parent] for joint in tree.path(link) if joint.parent in segment_of]
-    return above[-1] if above else None
+    added: dict[str, tuple[str, np.ndarray]] = {}  # name → the link it is fixed to, and its placement there
+    for name, (link, R, p) in frames.items():
+        M_KL = np.linalg.inv(M_WK[link]) @ pin.SE3(R, p).homogeneous
+        if name != link or not np.allclose(M_KL, np.eye(4), atol=1e-12):
+            added[name] = link, M_KL
+    if not np.allclose(M_WM, np.eye(4), atol=1e-12):
+        added["root"] = tree.root, M_WM
+    return _add_links(robot, added), named
 
 
 def _neutral_orientation(
     table: BodyTable, name: str, M_WK: Mapping[str, np.ndarray], p_W: Mapping[str, np.ndarray], R_above: np.ndarray
 ) -> np.ndarray:
-    """Orientation R_WL (3, 3) of a segment while all joints are at zero; `R_above`: of the segment above."""
+    """Return R_WL (3, 3) of a segment while all joints are at zero; `R_above`: of the segment above."""
     segment = table.segments[name]
     R_WK = M_WK[segment.link][:3, :3]
     if segment.up is not None and segment.forward is not None:
         return R_WK @ Rotation.from_quat(compute_mount(segment.up, segment.forward)).as_matrix().T
     if table.is_mechanism or all(each.link == key for key, each in table.segments.items()):
         return R_WK
-    if segment.spine:
-        return np.eye(3)
     ends = table.ends(name)
-    if ends is None or not set(ends[0] + ends[1]) <= set(p_W):
-        return R_above
+    if segment.spine or ends is None or not set(ends[0] + ends[1]) <= set(p_W):
+        return np.eye(3) if segment.spine else R_above
     first, last = (np.mean([p_W[point] for point in points], axis=0) for points in ends)
     along = last - first
     length = np.linalg.norm(along)
@@ -178,26 +174,12 @@ def _neutral_orientation(
     return Rotation.from_quat([*np.cross(segment.along, along / length), 1.0 + cosine]).as_matrix()
 
 
-def _with_links(
-    robot: Any,
-    root: str,
-    M_WM: np.ndarray,
-    M_WK: Mapping[str, np.ndarray],
-    frames: Mapping[str, tuple[str, np.ndarray, np.ndarray]],
-) -> Any:
-    """Add the links `frames` (name → the link it is fixed to, R_WL, p_WL) to the robot, on a root that is W.
+def _add_links(robot: Any, added: Mapping[str, tuple[str, np.ndarray]]) -> Any:
+    """Fix massless links to those of the robot; ``root`` becomes the link above the one that it names.
 
     A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
     """
-    yourdfpy, added = import_yourdfpy(), {}
-    for name, (link, R, p) in frames.items():
-        M_WL = np.eye(4)
-        M_WL[:3, :3], M_WL[:3, 3] = R, p
-        M_KL = np.linalg.inv(M_WK[link]) @ M_WL
-        if name != link or not np.allclose(M_KL, np.eye(4), atol=1e-12):
-            added[name] = link, M_KL
-    if not np.allclose(M_WM, np.eye(4), atol=1e-12):
-        added["root"] = root, M_WM
+    yourdfpy = import_yourdfpy()
     own = {link.name for link in robot.links}
     renamed = {name: f"{name}_link" for name in added if name in own}
     for link in robot.links:
@@ -216,7 +198,7 @@ def _with_links(
 
 
 def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[str, int], dict[str, np.ndarray]]:
-    """The Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
+    """Build the Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
 
     Second and third: its spherical joints and their axes, as `BodyModel` has them. Other joints have the URDF's limits.
     Without `spherical` triples of revolute joints stay as they are.
@@ -236,7 +218,7 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
         carry(link, parent, M_JL)
         for first in tree.below[link]:
             M_Jc = M_JL * pin.SE3(joint_placement(first))
-            triple = _triple(first, tree, links) if spherical else None
+            triple = _find_triple(first, tree, links) if spherical else None
             child = first.child if triple is None else triple[-1].child
             if first.type == "fixed":
                 grow(child, parent, M_Jc)
@@ -247,7 +229,7 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
                     M_Jc = M_Jc * pin.SE3(joint_placement(joint))
                 joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
                 if triple is not None:
-                    axes[child] = _axes(triple)
+                    axes[child] = _find_axes(triple)
                     # The links between the axes, as they stand at zero.
                     M_cK = pin.SE3.Identity()
                     for joint in triple[:0:-1]:
@@ -260,19 +242,19 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
 
 
 def joint_placement(joint: Any) -> np.ndarray:
-    """Placement (4, 4) of a joint, and so of its child at zero, in its parent link."""
+    """Return the placement (4, 4) of a joint, and so of its child at zero, in its parent link."""
     return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
 
 
 def joint_axis(joint: Any) -> np.ndarray:
-    """Unit axis (3,) of a joint in its own frame; URDF's default is x."""
+    """Return the unit axis (3,) of a joint in its own frame; URDF's default is x."""
     axis = np.asarray(joint.axis if joint.axis is not None else (1.0, 0.0, 0.0), dtype=float)
     norm = np.linalg.norm(axis)
     return axis / norm if norm > 1e-9 else np.zeros(3)
 
 
-def _triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> list[Any] | None:
-    """The three revolute joints that begin with `first` and together are a spherical joint, if they are."""
+def _find_triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> list[Any] | None:
+    """Find the three revolute joints that begin with `first` and together are a spherical joint."""
     chain = [first]
     while len(chain) < 3:
         below, link = tree.below[chain[-1].child], links[chain[-1].child]
@@ -282,12 +264,12 @@ def _triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> list[Any] | Non
         chain.append(below[0])
     turn = all(joint.type in ("revolute", "continuous") for joint in chain)
     meet = all(np.linalg.norm(joint_placement(joint)[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
-    axes = _axes(chain)
+    axes = _find_axes(chain)
     return chain if turn and meet and np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE else None
 
 
-def _axes(chain: list[Any]) -> np.ndarray:
-    """Axes (3, 3), a row each, in the frame of the last joint's child, all joints at zero."""
+def _find_axes(chain: list[Any]) -> np.ndarray:
+    """Return the axes (3, 3), a row each, in the frame of the last joint's child, all joints at zero."""
     rows = []
     for k, joint in enumerate(chain):
         axis = joint_axis(joint)
@@ -298,7 +280,7 @@ def _axes(chain: list[Any]) -> np.ndarray:
 
 
 def _find_bounds(joint: Any) -> tuple[float, float]:
-    """Lower and upper limit of a joint [rad or m]; a continuous one has none."""
+    """Return the lower and upper limit of a joint [rad or m]; a continuous one has none."""
     if joint.type == "continuous" or joint.limit is None:
         return -np.inf, np.inf
     low, high = joint.limit.lower, joint.limit.upper
@@ -326,12 +308,10 @@ def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: st
             f"{where}: joint '{joint.name}' is of type '{joint.type}', axis {axis.tolist()}; fixed, floating, or "
             f"{', '.join(kinds)} about an axis are known"
         )
-    most = (
-        np.inf if number is None else float(number)
-        for number in (getattr(joint.limit, "effort", None), getattr(joint.limit, "velocity", None))
-    )
-    limits = (np.array([number]) for number in (*most, *_find_bounds(joint)))
-    return int(model.addJoint(parent, kinds[joint.type](axis), M, joint.name, *limits))
+    most = [getattr(joint.limit, name, None) for name in ("effort", "velocity")]
+    limits = [np.inf if number is None else float(number) for number in most]
+    bounds = (np.array([number]) for number in (*limits, *_find_bounds(joint)))
+    return int(model.addJoint(parent, kinds[joint.type](axis), M, joint.name, *bounds))
 
 
 def _inertia(inertial: Any) -> pin.Inertia:
