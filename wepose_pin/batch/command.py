@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
-from ..commands.options import Number
-from ..commands.output import print_table, progress_bar, say
+from ..commands.options import Count
+from ..commands.output import Outcome, print_table, progress_bar, say
 
 
 def batch(
@@ -18,9 +18,9 @@ def batch(
     *,
     out: Annotated[str, Parameter(alias="-o", metavar="DIR|URL")],
     scheduler: Annotated[str | None, Parameter(metavar="ADDRESS")] = None,
-    workers: Number | None = None,
+    workers: Count | None = None,
     force: bool = False,
-) -> Any:  # a Study, whose modules load late
+) -> Outcome:  # of a Study
     """Run the same steps on many recordings, on all processors of this machine or on a Dask cluster.
 
     An item is one session of the plan with its steps. If it fails, the table has its error, and the others continue.
@@ -67,4 +67,4 @@ def batch(
     reused = f", {study.reused} of them before" if study.reused else ""
     say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
     say(f"Table: {out.rstrip('/')}/results.parquet")
-    return study
+    return Outcome(study, 3 if failed.height else 0)

@@ -34,11 +34,12 @@ def run_item(item: Item, place: str, force: bool = False) -> Row:
     begin = time.perf_counter()
     try:
         row = describe(item) | _run(item, f"{place}/{item.name}", force)
-    except WeposeError as error:
-        row = fail(item, type(error).__name__, str(error))
-    except Exception as error:  # a bug of ours: other items continue, and the table says where it is
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        row = fail(item, type(error).__name__, f"{error} ({Path(last.filename).name}:{last.lineno})")
+    except Exception as error:
+        message = str(error)
+        if not isinstance(error, WeposeError):  # a bug of ours: other items continue, and the table says where it is
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            message += f" ({Path(last.filename).name}:{last.lineno})"
+        row = fail(item, type(error).__name__, message)
     return {"seconds": time.perf_counter() - begin} | row
 
 

@@ -105,8 +105,7 @@ def fetch(url: str, into: Path, truth: bool = False) -> Path:
         for name in list_named_files(local, truth):
             if not (into / name).resolve().is_relative_to(into.resolve()):
                 raise BadData(f"{url}: names '{name}', outside its own folder; only files below it are fetched")
-            (into / name).parent.mkdir(parents=True, exist_ok=True)
-            system.get(f"{top}/{name}", str(into / name), recursive=system.isdir(f"{top}/{name}"))
+            system.get(f"{top}/{name}", str(into / name), recursive=True)
     return local
 
 
@@ -129,10 +128,9 @@ def create_folder(url: str) -> Iterator[Path]:
         with _open_filesystem(url) as (system, path):
             if system.exists(path):
                 system.rm(path, recursive=True)
-            for file in sorted(folder.rglob("*"), key=lambda file: file.name == DONE_FILE):
-                if file.is_file():
-                    target = f"{path}/{file.relative_to(folder).as_posix()}"
-                    system.makedirs(target.rpartition("/")[0], exist_ok=True)
-                    system.put_file(str(file), target)
+            done = (folder / DONE_FILE).read_bytes()
+            (folder / DONE_FILE).unlink()
+            system.put(f"{folder}/", f"{path}/", recursive=True)
+            system.pipe_file(f"{path}/{DONE_FILE}", done)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -18,7 +18,7 @@ import polars as pl
 from ..errors import BadOption, LostWorker, how_to_install, reason
 from ..filters.base import count_processors
 from .items import DONE, Row, fail, run_item
-from .plan import Item, Plan, read_plan
+from .plan import Item, read_plan
 from .storage import is_remote, open_study, write_bytes
 
 RESULTS = "results.parquet"
@@ -36,13 +36,8 @@ ItemProgress = Callable[[int, int, int], None]
 class Study(NamedTuple):
     """What came of a plan."""
 
-    plan: Plan
     table: pl.DataFrame  # a row an item, in the order of the plan
     reused: int  # items that were done before
-
-    @property
-    def exit_code(self) -> int:
-        return 3 if (self.table["status"] != DONE).any() else 0
 
 
 def run_batch(
@@ -63,9 +58,8 @@ def run_batch(
     WeposeError
         Of the plan or the place. The errors of an item are in its row.
     """
-    if workers is not None and (workers < 1 or scheduler is not None):
-        why = "they run at the scheduler, which knows how many" if scheduler else "at least 1"
-        raise BadOption(f"--workers {workers}: {why}")
+    if workers is not None and scheduler is not None:
+        raise BadOption(f"--workers {workers}: leave it out; the workers of --scheduler are running already")
     out = out.rstrip("/")
     place = f"{out}/items" if is_remote(out) else str(Path(out).absolute() / "items")
     plan = read_plan(plan_file, place)
@@ -89,7 +83,7 @@ def run_batch(
         content = io.BytesIO()
         table.write_parquet(content)
         write_bytes(f"{out}/{RESULTS}", content.getvalue())
-    return Study(plan, table, reused)
+    return Study(table, reused)
 
 
 @contextlib.contextmanager

@@ -12,10 +12,11 @@ from __future__ import annotations
 import io
 import logging
 import os
+import signal
 import sys
 
 from ..errors import WeposeError
-from .stopping import catch_signals, describe_written, ignore_signals, is_stopped
+from .stopping import catch_signals, describe_written, is_stopped
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -42,8 +43,7 @@ def main(argv: list[str] | None = None) -> None:
         code = 1
     except (KeyboardInterrupt, Exception) as error:
         if is_process:
-            ignore_signals()  # a second one would end in a traceback
-        # A library may turn the interrupt into an error of its own.
+            catch_signals(signal.SIG_IGN)  # a second one would end in a traceback
         if is_stopped() or isinstance(error, KeyboardInterrupt):
             code, line = 130, f"stopped; {describe_written()}"
         elif isinstance(error, WeposeError):
@@ -55,5 +55,5 @@ def main(argv: list[str] | None = None) -> None:
         print(f"wepose: {line}", file=sys.stderr)
     finally:
         if is_process:
-            ignore_signals()
+            catch_signals(signal.SIG_IGN)
     sys.exit(code)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .options import Force, Number, Out
+from .options import Force, Out, Seed
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
-from .simulate import PROTOCOL, check_seed
+from .simulate import PROTOCOL
 
 
-def demo(*, out: Out = Path("wepose-demo"), seed: Number = 1, force: Force = False) -> None:
+def demo(*, out: Out = Path("wepose-demo"), seed: Seed = 1, force: Force = False) -> None:
     """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
     A person of random size wears five Xsens MTi-3, stands in the N-pose, moves the joined hands and holds the T-pose, a
@@ -40,7 +40,6 @@ def demo(*, out: Out = Path("wepose-demo"), seed: Number = 1, force: Force = Fal
     from ..writers.provenance import collect_provenance, write_provenance
     from ..writers.result import as_json, write_subject
 
-    check_seed(seed)
     with progress_bar() as progress, whole_folder(out, force) as folder:
         progress("simulating a person", 0.0)
         person = simulate_person(seed)

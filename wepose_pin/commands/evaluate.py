@@ -149,12 +149,12 @@ def _say_registration(registration: Registration) -> None:
     """Say how the reference was brought to the result, and by which seconds."""
     from ..recording import format_span
 
-    stated = registration.correlation != registration.correlation  # NaN where the offset was stated
-    clock = "stated" if stated else f"speeds correlate by {registration.correlation:.3f}"
     say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
+    known = registration.correlation == registration.correlation  # NaN where the offset was stated
+    clock = f"speeds correlate by {registration.correlation:.3f}" if known else "stated"
     say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
     say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
     say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
     if registration.frames_deg:
-        listed = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
-        say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {listed}")
+        angles = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
+        say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {angles}")

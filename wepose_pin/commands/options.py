@@ -8,9 +8,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Group, Parameter, Token
+from cyclopts import Group, Parameter, Token, validators
 
-from ..errors import BadOption, WrongOption
+from ..errors import BadOption
 
 MORE = Parameter(group=Group("More options", sort_key=2))
 RESEARCH = Parameter(group=Group("Options for research", sort_key=3))
@@ -38,13 +38,6 @@ def _checked_by(place: str) -> Parameter:
     return Parameter(validator=check)
 
 
-def _check_model(_kind: type, model: str | None) -> None:
-    path = Path(model or "")
-    if model is not None and not path.is_file() and (path.suffix or len(path.parts) > 1):
-        needed = "no such file; a URDF, a TOML that names one, or the name of a body of the package is needed"
-        raise WrongOption("model", model, needed)
-
-
 def _read_entries(numbers: bool, words: Sequence[Token]) -> dict[str, Any]:
     """What several ``NAME=VALUE`` say: numbers alone, or else a text where it is no number."""
     needed, entries = "NAME=METRES" if numbers else "NAME=VALUE", dict[str, Any]()
@@ -56,7 +49,7 @@ def _read_entries(numbers: bool, words: Sequence[Token]) -> dict[str, Any]:
             raise BadOption(f"{word.keyword} {word.value}: '{name}' is given twice")
         entries[name] = value
         with contextlib.suppress(ValueError):
-            entries[name] = float(value)
+            entries[name] = int(value) if value.isdecimal() else float(value)
         if entries[name] != entries[name] or (numbers and entries[name] == value):
             raise BadOption(f"{word.keyword}: {word.value}: '{value}' is not a number; {needed} is needed")
     return entries
@@ -96,12 +89,16 @@ Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
 OutFile = Annotated[Path, Parameter(alias="-o", metavar="FILE")]
 Subject = Annotated[Path, Parameter(metavar="SUBJECT")]
 Session = Annotated[Path, Parameter(metavar="SESSION")]
-Model = Annotated[str, Parameter(metavar="NAME|FILE", validator=_check_model)]
+Model = Annotated[str, Parameter(metavar="NAME|FILE")]
 File = Annotated[Path, Parameter(metavar="FILE")]
 Name = Annotated[str, Parameter(metavar="NAME")]
 Number = Annotated[int, Parameter(metavar="NUMBER", converter=_read_whole_number)]
+Seed = Annotated[Number, Parameter(validator=validators.Number(gte=0))]
+Count = Annotated[Number, Parameter(validator=validators.Number(gte=1))]
 Hz = Annotated[float, Parameter(metavar="HZ")]
+SampleHz = Annotated[Hz, Parameter(validator=validators.Number(gte=20, lte=2000))]
 Seconds = Annotated[float, Parameter(metavar="SECONDS")]
+Duration = Annotated[Seconds, Parameter(validator=validators.Number(gte=5, lte=7200))]
 Factor = Annotated[float, Parameter(metavar="FACTOR")]
 Share = Annotated[float, Parameter(metavar="SHARE")]
 Radians = Annotated[float, Parameter(metavar="RAD")]

@@ -12,20 +12,19 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _stopped: list[int] = []
 
 
-def catch_signals() -> None:
-    """From here on both raise `KeyboardInterrupt`, and are remembered: a library may swallow that."""
-    for number in _SIGNALS:
-        signal.signal(number, _stop)
+def _stop(number: int, _frame: Any) -> None:
+    _stopped.append(number)
+    raise KeyboardInterrupt
 
 
-def ignore_signals() -> None:
-    """While Python itself ends, a signal would take the exit code's place."""
+def catch_signals(handler: Any = _stop) -> None:
+    """From here on both raise `KeyboardInterrupt` and are remembered, or are treated as by another handler."""
     for number in _SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, handler)
 
 
 def is_stopped() -> bool:
-    """Whether a signal came."""
+    """Whether a signal came; a library may have turned what it raised into an error of its own."""
     return bool(_stopped)
 
 
@@ -64,8 +63,3 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _stop(number: int, _frame: Any) -> None:
-    _stopped.append(number)
-    raise KeyboardInterrupt

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from ..diagnostics import Diagnostic, from_json
+from ..diagnostics import from_json
 from .options import MORE, RESEARCH, AcceptFailed, Force, Gaps, MethodOption, Model, Out, Subject
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
@@ -81,7 +81,6 @@ def track(
     from ..readers import is_live_log, load_session, read_live_log
     from ..readers.mvnx import read_subject
     from ..report.pages import write_track_pages
-    from ..report.viewer import MOST_FRAMES
     from ..tracking import CHUNK_S, SummaryAccumulator, TrackOptions, track_chunks
     from ..writers.provenance import collect_provenance, result_folder
     from ..writers.result import write_about, write_poses
@@ -119,20 +118,13 @@ def track(
             # Collected last, so that an input that is wrong is reported by its reader.
             provenance = collect_provenance("track", options)
             write_about(folder, accumulator.last, summary, joint_torques, provenance)
-        is_decimated = len(summary.tracked.time) < summary.content["samples"]
-        view_rate_hz = min(30.0, MOST_FRAMES / summary.content["duration_s"]) if is_decimated else None
-        failures: list[Diagnostic] = []
-        if view or report:
-            progress("making the pages", 2 / 3)
-            failures = write_track_pages(out, summary, view=view, report=report, fps=view_rate_hz or 30.0)
+        progress("making the pages", 2 / 3)
+        failures = write_track_pages(out, summary, view=view, report=report)
     content = summary.content
     print_diagnostics(from_json(each) for each in content["diagnostics"])
     _print_sensors(content)
-    if "joints" in content:
-        _print_joints(content)
     print_diagnostics(failures)
-    motion = "Motion" + (f", {view_rate_hz:.2g} frames a second" if view_rate_hz else "")
-    say_pages(out, ({"Report": "report.html"} if report else {}) | ({motion: "view.html"} if view else {}))
+    say_pages(out, ({"Report": "report.html"} if report else {}) | ({"Motion": "view.html"} if view else {}))
     say(f"Pose: {out / 'pose.parquet'}  ({len(content['sensors'])} segments, {len(content['points'])} points)")
     if "joints" in content:
         say(f"Joints: {out / 'joints.parquet'}")
@@ -157,12 +149,3 @@ def _print_sensors(summary: Mapping[str, Any]) -> None:
         ("sensor", "static", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
         rows,
     )
-
-
-def _print_joints(summary: Mapping[str, Any]) -> None:
-    """Print the range of each joint of a mechanism."""
-    rows = []
-    for name, values in summary["joints"].items():
-        unknown = "undetermined" if name in summary["undetermined_joints"] else ""
-        rows.append((name, f"{values['min']:.3f}", f"{values['max']:.3f}", unknown))
-    print_table("Joints [rad or m]", ("joint", "minimum", "maximum", ""), rows)

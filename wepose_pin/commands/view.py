@@ -41,7 +41,7 @@ def view(
     from ..writers.result import read_phases
 
     if out is None and (interval is not None or phase is not None):
-        option = "phase" if interval is None else "interval"
+        option = f"phase {phase}" if interval is None else "interval {:g} {:g}".format(*interval)
         raise BadOption(f"--{option}: needs -o FILE; view.html in the result shows the whole recording")
     page = out or result / "view.html"
     if not (result / "pose.parquet").is_file():

@@ -25,14 +25,14 @@ FRAME_HEIGHT = 560  # [px] of the view page in a notebook
 
 
 def write_track_pages(
-    folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True, fps: float = 30.0
+    folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True
 ) -> list[Diagnostic]:
-    """Write ``view.html``, with so many frames a second, and ``report.html`` beside a result; as `write_pages`."""
+    """Write ``view.html`` and ``report.html`` beside a result; as `write_pages`."""
     tracked, recording = summary.tracked, summary.tracked.recording
 
     @cache
     def make_view() -> str:
-        return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps)
+        return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name)
 
     def make_report() -> str:
         from .track import render_track_report  # with it comes matplotlib

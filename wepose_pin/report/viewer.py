@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips, of a body without feet
 FEET_Z = -0.6  # [m] below which a point of a person is at a foot
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
-FRAMES_A_SECOND, MOST_FRAMES = 20.0, 5000  # of a motion inside a report
+FRAMES_A_SECOND = 30.0
+MOST_FRAMES, MOST_FRAMES_INSIDE = 20_000, 4000  # of a page, and of one inside a report; the browser interpolates
 MOST_POSES, DIRECTIONS = 150, 100  # by which the camera is placed
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
 LIGHTS = (  # meshcat's own; positions in W [m]
@@ -75,14 +76,15 @@ def pose_html(
     *,
     phases: Phases = MappingProxyType({}),
     title: str = "",
-    fps: float = 30.0,
+    most_frames: int = MOST_FRAMES,
 ) -> str:
     """The page that plays `pose` on `model`, with trails of the points whose path is drawn; parameters as `view_html`.
 
     Segments that no sensor measured are drawn rigid with the one above where the model's table says so; what is not
     known is not drawn.
     """
-    frames = frame_indices(pose.time, fps)
+    seconds = max(float(pose.time[-1] - pose.time[0]), 1e-3)
+    frames = frame_indices(pose.time, min(FRAMES_A_SECOND, most_frames / seconds))
     visuals, placed = _place_body(model, pose, frames)
     paths = [name for name in model.table.draw.paths if name in pose.points]
     angles = {}
@@ -115,10 +117,8 @@ def _place_body(
 
 
 def show_motion(model: BodyModel, pose: Pose, phases: Phases, title: str) -> Frame:
-    """A motion inside a report, in fewer frames a second where it is long; parameters as `pose_html`."""
-    fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(pose.time[-1] - pose.time[0]), 1e-3))
-    rate = f" Here at {fps:.1f} frames a second." if fps < FRAMES_A_SECOND else ""
-    return Frame(pose_html(model, pose, phases=phases, title=title, fps=fps), rate)
+    """A motion inside a report; parameters as `pose_html`."""
+    return Frame(pose_html(model, pose, phases=phases, title=title, most_frames=MOST_FRAMES_INSIDE))
 
 
 def find_floor(model: BodyModel) -> float:
@@ -132,7 +132,7 @@ def find_floor(model: BodyModel) -> float:
     return lowest if lowest < FEET_Z else FLOOR_Z
 
 
-def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
+def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "") -> str:
     """The page on which a person and the robot that does as they do move together, on the robot's time.
 
     The hands at their targets, beyond the reach too, are drawn translucent.
@@ -141,7 +141,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     from ..retargeting.targets import find_person_arm
     from ..retargeting.visuals import build_parts, compute_placements, compute_target_placements
 
-    frames = frame_indices(trajectory.time, fps)
+    frames = frame_indices(trajectory.time, FRAMES_A_SECOND)
     nearest = np.searchsorted(0.5 * (pose.time[:-1] + pose.time[1:]), trajectory.recorded_time[frames])
     visuals, placed = _place_body(model, pose, nearest)
     robot, parts = trajectory.robot, build_parts(trajectory.robot)
