@@ -15,7 +15,17 @@ SEGMENTS = tuple(TABLE.segments)
 LENGTHS = tuple(TABLE.lengths)
 POINTS = {name: point.link for name, point in TABLE.points.items()}
 # Girdles of a person whose shoulders do not move on the torso, as those of ideal and mild simulated people: no law.
+GIRDLE_ROWS = tuple(  # of a subject's covariance
+    f"girdles.{name}.{parameter}"
+    for name in TABLE.girdles
+    for parameter in ("law", "rest_x", "rest_y", "rest_z", "raised_x", "raised_y", "raised_z")
+)
 RIGID_SHOULDERS = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}
+
+
+def mount_rows(*segments: str) -> tuple[str, ...]:
+    """Names of the mounts' rows of a subject's covariance."""
+    return tuple(f"mounts.{segment}.{axis}" for segment in segments for axis in "xyz")
 
 
 def measure_residuals(body: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

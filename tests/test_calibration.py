@@ -6,20 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
+from bodies import GIRDLE_ROWS, LENGTHS, RIGID_SHOULDERS, mount_rows
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.subject import Subject, girdle_rows, mount_rows, population_subject
-from wepose_pin.calibration import Calibration, calibrate
-from wepose_pin.calibration.quality import assess
-from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
-from wepose_pin.simulation.motion import Motion
-from wepose_pin.simulation.signals import Wander
+import wepose_pin as wp
+from wepose_pin import OrientationSensor, Recording, Simulation, Subject, calibrate, population_subject, simulate
+from wepose_pin.simulation import Person, simulate_person
 
 
-def codes(calibration: Calibration) -> set[str]:
+def codes(calibration: wp.Calibration) -> set[str]:
     return {diagnostic.code for diagnostic in calibration.diagnostics}
 
 
@@ -31,19 +27,18 @@ def ready(simulation: Simulation) -> Recording:
 
 def with_rigid_shoulders(subject: Subject) -> Subject:
     """The same of a person whose shoulders are known not to move on the torso."""
-    rows = girdle_rows(TABLE)
     return replace(
         subject,
         girdles=RIGID_SHOULDERS,
-        order=(*subject.order, *rows),
-        covariance=block_diag(subject.covariance, np.zeros((len(rows), len(rows)))),
+        order=(*subject.order, *GIRDLE_ROWS),
+        covariance=block_diag(subject.covariance, np.zeros((len(GIRDLE_ROWS), len(GIRDLE_ROWS)))),
     )
 
 
 @pytest.fixture(scope="module")
 def exact() -> tuple[Person, Recording]:
     person = simulate_person(11)
-    return person, ready(simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0))
+    return person, ready(simulate(person.lengths, seed=11, noise=wp.NOISE_FREE, clasp_s=30.0, circles=0))
 
 
 def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tuple[Person, Recording]) -> None:
@@ -69,7 +64,7 @@ def test_all_mounts_share_the_heading_of_a_start_pose_in_which_the_arms_are_rais
     """The torso faces forwards to within its soft tissue: about the vertical, which is across an arm in the T-pose."""
     person = simulate_person(11)
     recording = ready(
-        simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0, protocol="clasp+t_pose")
+        simulate(person.lengths, seed=11, noise=wp.NOISE_FREE, clasp_s=30.0, circles=0, protocol="clasp+t_pose")
     )
     phases = {**recording.phases, "start": recording.phases["t_pose"]}
     calibration = calibrate(replace(recording, phases=phases, start_pose="t_pose"))
@@ -86,7 +81,7 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     """Exact motion, no noise: headings drawn from the full circle come back without a guess."""
     person = simulate_person(3)
     simulation = simulate(
-        person.lengths, seed=3, noise=NOISE_FREE, imperfections=replace(IDEAL_PRESET, mount="any"), circles=0
+        person.lengths, seed=3, noise=wp.NOISE_FREE, imperfections=replace(wp.IDEAL_PRESET, mount="any"), circles=0
     )
     recording = simulation.recording()
     assert all(sensor.stated_quat_LS is None for sensor in recording.sensors.values())
@@ -168,20 +163,19 @@ def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     assert alone.subject.note.endswith("of the population prior")
 
 
-def test_hands_that_hardly_move_leave_the_headings_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The closure has several minima then: ± 2.4 deg of one of them was stated at 118 deg off."""
-    scale, seed = 0.05, 1
-    point, wander = Motion._clasp_point, Wander.__call__
-    monkeypatch.setattr(Motion, "_clasp_point", lambda self, t, moving: point(self, t, scale * moving))
-    monkeypatch.setattr(Motion, "lean_deg", scale * Motion.lean_deg)
-    monkeypatch.setattr(Wander, "__call__", lambda self, t: scale * wander(self, t))
-    person = simulate_person(seed)
-    made = simulate(
-        person.lengths, seed=seed, clasp_s=30.0, circles=0, imperfections=replace(IDEAL_PRESET, mount="any")
-    )
-    calibration = calibrate(made.recording(), measured=person.measured, prior=person.prior)
-    for name, quat in calibration.subject.mounts.items():
-        off = (Rotation.from_quat(quat) * Rotation.from_quat(made.quat_LS[name]).inv()).as_rotvec()
-        assert abs(off[2]) < 4.0 * calibration.subject.std(f"mounts.{name}.z"), name
-    assert assess(calibration).quality == "fail"
-    assert "headings-ambiguous" in codes(calibration)
+def test_nothing_is_printed(exact: tuple[Person, Recording], capfd: pytest.CaptureFixture[str]) -> None:
+    calibrate(exact[1])
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+def test_soft_tissue_of_the_torso_is_no_heading() -> None:
+    """The closure alone is off by 6 deg on this person, whose tissue turns the sensor as he leans."""
+    person, imperfections = simulate_person(6), replace(wp.PEOPLE_PRESET, mount="any")
+    simulation = simulate(person.lengths, seed=6, imperfections=imperfections, circles=0, rate_hz=50.0)
+    measured = {"shoulder_width": person.measured["shoulder_width"]}
+    subject = calibrate(simulation.recording(), measured=measured, prior=person.prior).subject
+    error = Rotation.from_quat(subject.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
+    off = abs(error.as_rotvec()[2])
+    assert np.degrees(off) < 3.0
+    assert off < 2.0 * subject.std("mounts.torso.z")

@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from bodies import LENGTHS
+from bodies import LENGTHS, mount_rows
 from bodies import RIGID_SHOULDERS as RIGID
 from scipy.spatial.transform import Rotation
 
@@ -18,10 +18,6 @@ from wepose_pin.tracking import Tracker
 
 HINGES = {joint: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for joint in ("left_elbow", "right_elbow")}
 LIMB = ("torso", "right_upper_arm", "right_forearm")
-
-
-def mount_rows(*segments: str) -> tuple[str, ...]:
-    return tuple(f"mounts.{segment}.{axis}" for segment in segments for axis in "xyz")
 
 
 @pytest.fixture(scope="module")
