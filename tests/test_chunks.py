@@ -10,30 +10,11 @@ import numpy as np
 import polars as pl
 import pytest
 from commands import run
-from reading import text_of
 
-from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import build_pose_table
-from wepose_pin.body.subject import Subject
-from wepose_pin.calibration import calibrate
-from wepose_pin.data_tables import read_table
-from wepose_pin.errors import WeposeError
-from wepose_pin.readers import load_session
-from wepose_pin.recording import Recording
-from wepose_pin.report.track import render_track_report
-from wepose_pin.simulation import Person, Simulation, simulate
-from wepose_pin.tracking import (
-    SummaryAccumulator,
-    Tracker,
-    TrackOptions,
-    TrackResult,
-    TrackSummary,
-    summarize,
-    track,
-    track_chunks,
-)
+from wepose_pin import Simulation, Subject, WeposeError, calibrate, simulate, track
+from wepose_pin.simulation import Person
+from wepose_pin.tracking import Tracker, TrackOptions, track_chunks
 from wepose_pin.writers import write_session
-from wepose_pin.writers.result import write_subject
 
 
 @pytest.fixture(scope="module")
@@ -52,28 +33,6 @@ def subject(made: Simulation, person: Person) -> Subject:
     return calibration.subject
 
 
-@pytest.fixture
-def session(made: Simulation, tmp_path: Path) -> Path:
-    return written(tmp_path / "session", made.recording())
-
-
-def written(folder: Path, recording: Recording) -> Path:
-    folder.mkdir(parents=True)
-    write_session(folder, recording)
-    return folder
-
-
-def joined(chunks: list[TrackResult]) -> pl.DataFrame:
-    return pl.concat([build_pose_table(chunk.pose, covariance=True) for chunk in chunks])
-
-
-def summarize_chunks(recording: Recording, chunks: list[TrackResult]) -> TrackSummary:
-    accumulator = SummaryAccumulator(recording)
-    for chunk in chunks:
-        accumulator.add(chunk)
-    return accumulator.finish()
-
-
 @pytest.mark.parametrize(
     ("method", "seconds"),
     [("amekf", 7.31), *(pytest.param(*case, marks=pytest.mark.slow) for case in (("smekf", 5.0), ("ncf", 2.0)))],
@@ -83,11 +42,22 @@ def test_chunks_put_together_are_the_whole(made: Simulation, subject: Subject, m
     whole = track(recording, subject, method=method)
     chunks = list(track_chunks(recording, subject, options=TrackOptions(method), chunk_s=seconds))
     assert len(chunks) > 2
-    assert joined(chunks).equals(build_pose_table(whole.pose, covariance=True))
+    for part in ("quat_WL", "points"):
+        for name, values in getattr(whole, part).items():
+            assert np.array_equal(np.concatenate([getattr(chunk, part)[name] for chunk in chunks]), values), name
+    for name, cov in whole.pose.point_cov.items():
+        assert np.array_equal(np.concatenate([chunk.pose.point_cov[name] for chunk in chunks]), cov), name
     assert whole.correction is not None
     assert chunks[-1].correction is not None
     assert max(whole.correction.max_correction_deg.values()) > 0.01  # there was something to hold
-    assert summarize_chunks(recording, chunks).content == summarize(whole).content
+
+
+def test_an_open_loop_in_chunks_is_the_whole(made: Simulation, subject: Subject) -> None:
+    options = TrackOptions(open_loop=True)
+    whole = track(made.recording(), subject, open_loop=True)
+    chunks = list(track_chunks(made.recording(), subject, options=options, chunk_s=30.0))
+    for name, quat in whole.quat_WL.items():
+        assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat)
 
 
 def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:
@@ -102,49 +72,21 @@ def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:
 # The command ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def person_folder(subject: Subject, tmp_path: Path) -> Path:
-    folder = tmp_path / "person"
-    folder.mkdir()
-    write_subject(folder, subject, load_model().with_lengths(dict(subject.lengths)))
-    return folder
-
-
-def test_the_command_gives_the_same_folder(session: Path, person_folder: Path, tmp_path: Path, monkeypatch) -> None:
-    options = [session, "--subject", person_folder, "--covariance"]
-    assert run("track", *options, "-o", tmp_path / "whole") == 0
+def test_the_command_gives_the_same_folder(
+    made: Simulation, subject: Subject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("session", "person"):
+        (tmp_path / name).mkdir()
+    write_session(tmp_path / "session", made.recording())
+    subject.save(tmp_path / "person")
+    words = [tmp_path / "session", "--subject", tmp_path / "person", "--covariance"]
+    assert run("track", *words, "-o", tmp_path / "whole") == 0
     monkeypatch.setattr("wepose_pin.tracking.CHUNK_S", 10.0)
     places = tmp_path / "whole", tmp_path / os.fsdecode(b"chunks[1]\xff")  # which polars takes for no path
-    assert run("track", *options, "-o", places[1]) == 0
+    assert run("track", *words, "-o", places[1]) == 0
     names = [sorted(path.name for path in place.iterdir()) for place in places]
     assert names[0] == names[1]
-    whole, chunks = (read_table(place / "pose.parquet") for place in places)
+    whole, chunks = (pl.read_parquet((place / "pose.parquet").read_bytes()) for place in places)
     assert chunks.equals(whole)
     whole, chunks = (json.loads((place / "summary.json").read_text()) for place in places)
     assert chunks | {"provenance": None} == whole | {"provenance": None}
-
-
-def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
-    """What lasts, what is lost and what was largest are those of all samples, though one in eighteen is kept."""
-    recording = load_session(session)
-    pose = track(recording, subject)
-    full = summarize(pose)
-    monkeypatch.setattr("wepose_pin.tracking.summary.MOST_SAMPLES", 300)
-    summary = summarize_chunks(recording, list(track_chunks(recording, subject, chunk_s=7.31)))
-    thin, totals, wanted = summary.tracked, summary.measures, full.measures
-    assert totals.samples == len(pose.time) == 5698
-    assert len(thin.time) == 317
-    np.testing.assert_array_equal(thin.time, pose.time[::18])
-    assert totals.steps_ms == pytest.approx(wanted.steps_ms)
-    for name, signal in wanted.signals.items():
-        ours = totals.signals[name]
-        bins = [signal.rate[first : first + 18].max() for first in range(0, 5698, 18)]
-        np.testing.assert_allclose(ours.rate, bins, rtol=1e-12)
-        assert ours.static is not None
-        assert signal.static is not None
-        np.testing.assert_array_equal(ours.static, [signal.static[k : k + 18].all() for k in range(0, 5698, 18)])
-    for name, tip in wanted.tips.items():
-        assert totals.tips[name].peak_speed == pytest.approx(tip.peak_speed, rel=1e-12)
-    page = render_track_report(summary)
-    assert "5698 samples at 100 Hz" in text_of(page)
-    assert "for 317 samples, one in 18" in text_of(page)

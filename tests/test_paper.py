@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,9 @@ from bodies import LENGTHS, SEGMENTS
 from commands import run
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.subject import load_subject
-from wepose_pin.calibration import Calibration, assess, calibrate
-from wepose_pin.diagnostics import render
-from wepose_pin.errors import WeposeError
-from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
-from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
-from wepose_pin.tracking import TrackOptions, track, track_chunks
+import wepose_pin as wp
+from wepose_pin import Calibration, OrientationSensor, Recording, Simulation, WeposeError, calibrate, track
+from wepose_pin.simulation import Person, simulate, simulate_person
 from wepose_pin.writers import write_session
 
 SENSORS = SEGMENTS[:5]
@@ -31,7 +26,7 @@ SENSORS = SEGMENTS[:5]
 def made() -> tuple[Person, Simulation, Recording]:
     """Usual imperfections, so that nothing closes exactly."""
     person = simulate_person(5)
-    simulation = simulate(person.lengths, seed=5, imperfections=MILD_PRESET, clasp_s=36.0, circles=1)
+    simulation = simulate(person.lengths, seed=5, imperfections=wp.MILD_PRESET, clasp_s=36.0, circles=1)
     return person, simulation, simulation.recording()
 
 
@@ -116,7 +111,7 @@ def test_the_outcome_holds_lengths_and_says_what_its_deviations_lack(estimated: 
     assert (subject.mounts, subject.hinges, subject.start_pose_offset, subject.heading_drift) == ({}, {}, {}, {})
     assert subject.order == LENGTHS
     assert subject.note == "hands together, lengths alone as in the paper; scale measured: shoulder_width"
-    checks = {check.diagnostic.code for check in assess(estimated).checks}
+    checks = {check.diagnostic.code for check in estimated.quality.checks}
     assert {"length-uncertain", "closure-gap-large"} <= checks
     assert "mount-heading-uncertain" not in checks
     assert 1.0 < estimated.effective_sample_size < 12.1  # 36 s of errors that last 3 s and more
@@ -124,7 +119,7 @@ def test_the_outcome_holds_lengths_and_says_what_its_deviations_lack(estimated: 
 
 def test_exact_orientations_give_the_lengths_back() -> None:
     person = simulate_person(11)
-    simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=20.0, circles=0)
+    simulation = simulate(person.lengths, seed=11, noise=wp.NOISE_FREE, clasp_s=20.0, circles=0)
     sensors = {name: OrientationSensor(quat_VS=quat) for name, quat in simulation.quat_WL.items()}
     recording = replace(simulation.recording("exact"), sensors=sensors)
     measured = {name: person.lengths[name] for name in ("left_upper_arm", "left_hand", "right_forearm")}
@@ -137,11 +132,11 @@ def test_exact_orientations_give_the_lengths_back() -> None:
 def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulation, Recording]) -> None:
     person, _, recording = made
     calibration = calibrate(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
-    quality = assess(calibration)
+    quality = calibration.quality
     (contradicted,) = [each for each in quality.reasons if each.code == "length-contradicted"]
     assert quality.quality == "fail"
     width = 1e3 * person.prior.lengths["shoulder_width"]
-    assert f"was measured as 600 mm. All else gives {width:.0f} mm ±" in render(contradicted).what
+    assert f"was measured as 600 mm. All else gives {width:.0f} mm ±" in str(contradicted)
 
 
 @pytest.mark.parametrize(
@@ -159,13 +154,11 @@ def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[P
         calibrate(made[2], **({"formulation": "paper"} | options))
 
 
-@pytest.mark.parametrize("start_pose", ["t_pose", CONFIGURATION])
-def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simulation, Recording]) -> None:
+def test_another_start_pose_is_refused(made: tuple[Person, Simulation, Recording]) -> None:
     """Its orientations are relative to the start pose: in the T-pose they would be those of other arms."""
-    recording = replace(made[2], start_pose=start_pose)
-    expected = f"start_pose = '{start_pose}'; record a start in n_pose, or use --formulation full"
-    with pytest.raises(WeposeError, match=re.escape(expected)):
-        calibrate(recording, measured={"shoulder_width": 0.4}, formulation="paper")
+    expected = "start_pose = 't_pose'; record a start in n_pose, or use --formulation full"
+    with pytest.raises(WeposeError, match=expected):
+        calibrate(replace(made[2], start_pose="t_pose"), measured={"shoulder_width": 0.4}, formulation="paper")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +171,7 @@ def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simu
 def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> None:
     """Arms that hang, or swing on their own: the gap cannot close, and arms of no length are its least."""
     person = simulate_person(11)
-    simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=6.0, circles=0)
+    simulation = simulate(person.lengths, seed=11, noise=wp.NOISE_FREE, clasp_s=6.0, circles=0)
     since = np.clip(simulation.time - 5.0, 0.0, None)
     sensors = {}
     for k, name in enumerate(simulation.quat_WL):
@@ -204,14 +197,6 @@ def test_open_loop_leaves_the_headings_as_the_filter_has_them(made: tuple[Person
     )
     assert corrected.correction is not None
     assert free.correction is None
-    options = TrackOptions(open_loop=True)
-    for parts, whole in (
-        (list(track_chunks(recording, subject, options=options, chunk_s=30.0)), free),
-        (list(track_chunks(recording, subject, chunk_s=30.0)), corrected),
-    ):
-        assert len(parts) > 1
-        for name, quat in whole.quat_WL.items():
-            np.testing.assert_array_equal(np.concatenate([part.quat_WL[name] for part in parts]), quat)
     # Uncorrected as a live session is, but for its start half a second later.
     for name, quat in causal.quat_WL.items():
         offline = Rotation.from_quat(free.quat_WL[name][-len(quat) :])
@@ -239,8 +224,8 @@ def test_the_commands(
     assert "Mounts" not in captured.out
     content = json.loads((tmp_path / "anna" / "calibration.json").read_text())
     assert content["provenance"]["options"]["formulation"] == "paper"
-    assert load_subject(tmp_path / "anna").mounts == {}
-    assert {values[0] for values in load_subject(tmp_path / "anna").girdles.values()} == {-1.0}  # fixed shoulders
+    assert wp.load_subject(tmp_path / "anna").mounts == {}
+    assert {values[0] for values in wp.load_subject(tmp_path / "anna").girdles.values()} == {-1.0}  # fixed shoulders
     page = (tmp_path / "anna" / "report.html").read_text(encoding="utf-8")
     assert "leave out errors of mounts" in page
 
@@ -250,9 +235,6 @@ def test_the_commands(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["heading_correction"] is None
     assert summary["provenance"]["options"]["open_loop"] is True
-    tracked = track(recording, load_subject(tmp_path / "anna"), method="smekf_published", open_loop=True)
+    tracked = track(recording, wp.load_subject(tmp_path / "anna"), method="smekf_published", open_loop=True)
     palm = pl.read_parquet(out / "pose.parquet", columns=["right_palm_x"]).to_series().to_numpy()
     np.testing.assert_allclose(palm, tracked.points["right_palm"][:, 0], atol=1e-9)
-
-
-# Validation -----------------------------------------------------------------------------------------------------------

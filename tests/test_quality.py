@@ -11,25 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from commands import run
+from scipy.spatial.transform import Rotation, Slerp
 
 import wepose_pin as wp
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate
-from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
-from wepose_pin.commands import main
-from wepose_pin.diagnostics import ERROR, from_json, render
-from wepose_pin.errors import WeposeError
-from wepose_pin.recording import Recording
-from wepose_pin.simulation import (
-    MILD_PRESET,
-    Imperfections,
-    Person,
-    Simulation,
-    simulate,
-    simulate_person,
-)
-from wepose_pin.simulation import motion as motions
-from wepose_pin.simulation.motion import TASKS
+from wepose_pin import MILD_PRESET, Calibration, OrientationSensor, Recording, Simulation, WeposeError, calibrate
+from wepose_pin.simulation import Person, simulate, simulate_person
 from wepose_pin.writers import write_session
 
 ANY = replace(MILD_PRESET, mount="any")
@@ -51,25 +38,14 @@ def stated(person: Person) -> Simulation:
     return simulate(person.lengths, seed=SEED, imperfections=MILD_PRESET, circles=0)
 
 
-def moved_otherwise(person: Person, share: Mapping[str, float], imperfections: Imperfections = ANY) -> Simulation:
-    """The same person, with these parts of the motion at a share of their size; ``hands`` parts them now and then."""
-
-    class Less(motions.Motion):
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, **options)
-            for name, wander in self.wander.items():
-                part = share.get(name, share.get("all", 1.0))
-                self.wander[name] = lambda t, wander=wander, part=part: part * wander(t)  # type: ignore[assignment]
-            if "hands" in share:
-                # Together and apart for ten seconds each.
-                self.flaws.slip = [
-                    lambda t, slip=slip: slip(t) * (0.5 + 0.5 * np.tanh(8.0 * np.sin(np.pi * t / 10.0)))  # type: ignore[misc]
-                    for slip in self.flaws.slip
-                ]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(TASKS, "clasp", Less)
-        return simulate(person.lengths, seed=SEED, imperfections=imperfections, circles=0)
+def as_orientations(simulation: Simulation, quat_WL: Mapping[str, np.ndarray], stated: bool = False) -> Recording:
+    """A recording of exact orientations; how sensors sit is stated or not known."""
+    sensors = {}
+    for name, quat in quat_WL.items():
+        mount = simulation.quat_LS[name]
+        quat_WS = (Rotation.from_quat(quat) * Rotation.from_quat(mount)).as_quat()
+        sensors[name] = OrientationSensor(quat_WS, mount if stated else None)
+    return replace(simulation.recording(), sensors=sensors)
 
 
 def solved(recording: Recording, person: Person, measured: bool = True) -> Calibration:
@@ -155,7 +131,7 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
 QUICK = ("as it should be", "the forearms exchanged", "six seconds of motion")
 
 
-def codes(quality: CalibrationQuality) -> list[str]:
+def codes(quality: Any) -> list[str]:
     return [diagnostic.code for diagnostic in quality.reasons]
 
 
@@ -163,7 +139,7 @@ def codes(quality: CalibrationQuality) -> list[str]:
 @pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * (case not in QUICK)) for case in CASES])
 def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: Person) -> None:
     change, wanted, first = CASES[case]
-    quality = assess(solved(change(anywhere.recording()), person))
+    quality = solved(change(anywhere.recording()), person).quality
     reasons = [(d.code, d.place, str(d.facts.get("variant", ""))) for d in quality.reasons]
     print(case, "→", quality.quality, reasons)
     assert quality.quality == wanted
@@ -173,15 +149,15 @@ def test_what_goes_wrong_is_diagnosed(case: str, anywhere: Simulation, person: P
     assert len(set(reasons)) == len(reasons)  # each once
     if wanted == "fail":  # of another arrangement of sensors, and beside what was too short, nothing else is said
         assert reasons[0] == first[0]
-        assert quality.reasons[0].severity is ERROR
+        assert quality.reasons[0].severity == "error"
         assert len({code for code, _, _ in reasons}) == 1
 
 
 def test_without_a_measured_length_the_scale_is_the_priors(unmeasured: Calibration) -> None:
-    quality = assess(unmeasured)
+    quality = unmeasured.quality
     assert quality.quality == "poor"
     assert codes(quality) == ["scale-uncertain"]
-    assert "--measured biacromial" in render(quality.reasons[0]).do
+    assert "--measured biacromial" in str(quality.reasons[0])
     assert "scale-uncertain" not in {each.code for each in quality.further}  # not twice
 
 
@@ -203,45 +179,34 @@ def test_a_failed_calibration_says_so_and_is_not_tracked(
     assert "Measure" in repr(unmeasured)
 
 
-@pytest.mark.parametrize(
-    ("share", "wanted", "cause"),
-    [
-        ({"all": 0.0}, "fail", "soft-tissue"),
-        ({"all": 0.05}, "poor", "limbs"),
-        pytest.param(
-            {"roll": 0.02, "pitch": 0.02, "yaw": 0.02},
-            "fail",
-            "spine",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
-def test_too_little_motion_is_named(share: dict[str, float], wanted: str, cause: str, person: Person) -> None:
-    calibration = solved(moved_otherwise(person, share).recording(), person)
-    quality = assess(calibration)
-    print(codes(quality))
-    assert quality.quality == wanted
-    variants = {each.facts.get("variant", "") for each in quality.reasons if each.code == "motion-too-small"}
-    assert cause in variants
+def test_hands_that_hardly_move_are_named(anywhere: Simulation, person: Person) -> None:
+    """The clasp at a twentieth of its speed: three seconds of it in a minute."""
+    ((begin, _),) = anywhere.phases["clasp"]
+    slow = np.where(anywhere.time > begin, begin + (anywhere.time - begin) / 20.0, anywhere.time)
+    quat_WL = {
+        name: Slerp(anywhere.time, Rotation.from_quat(q))(slow).as_quat() for name, q in anywhere.quat_WL.items()
+    }
+    quality = solved(as_orientations(anywhere, quat_WL), person).quality
+    assert quality.quality == "fail"
+    assert "motion-too-small" in codes(quality)
 
 
-@pytest.mark.slow
-def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person, good: Calibration) -> None:
-    simulation = moved_otherwise(person, {"hands": 1.0}, replace(ANY, palm_slip=0.15))
-    calibration = solved(simulation.recording(), person)
-    quality = assess(calibration)
-    print(codes(quality), 1e3 * arm_errors(calibration, person), 1e3 * arm_errors(good, person))
-    assert quality.quality == "poor"
-    (apart,) = [d for d in quality.diagnostics if d.code == "closure-open"]
-    assert apart.value is not None
-    assert OPEN_SHARE.passes < apart.value < 0.6
-    assert "Keep the points together" in render(apart).do
+def test_hands_apart_for_a_quarter_of_the_time_are_found_and_left_out(anywhere: Simulation, person: Person) -> None:
+    """The left arm swings away by 30 deg now and then."""
+    swing = np.sin(np.pi * (anywhere.time - 5.0) / 10.0) - 0.5
+    away = 30.0 * np.clip(3.0 * swing, 0.0, 1.0) * (anywhere.time > 7.5)
+    quat_WL = dict(anywhere.quat_WL)
+    for name in ("left_upper_arm", "left_forearm"):
+        turned = Rotation.from_euler("z", away[:, None], degrees=True) * Rotation.from_quat(quat_WL[name])
+        quat_WL[name] = turned.as_quat()
+    calibration = solved(as_orientations(anywhere, quat_WL, stated=True), person)
+    (apart,) = [d for d in calibration.quality.diagnostics if d.code == "closure-open"]
+    assert 0.2 < apart.value < 0.4
+    assert "Keep the points together" in str(apart)
     assert np.abs(arm_errors(calibration, person)).max() < 0.025
-    assert np.abs(heading_errors(calibration, simulation.quat_LS)[1:]).max() < 8.0
-    gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
-    at = np.searchsorted(simulation.time, calibration.time - 1e-6)
-    assert np.mean(calibration.contact[gap[at] > 0.2]) < 0.1
-    assert np.mean(calibration.contact[gap[at] < 0.02]) > 0.8
+    at = away[np.searchsorted(anywhere.time, calibration.time - 1e-6)]
+    assert np.mean(calibration.contact[at > 20.0]) < 0.1
+    assert np.mean(calibration.contact[at < 1.0]) > 0.8
 
 
 @pytest.mark.slow
@@ -250,13 +215,13 @@ def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
 ) -> None:
     over = Rotation.from_rotvec([0.0, 0.0, np.pi])
     calibration = solved(turned(anywhere.recording(), "left_forearm", over), person)
-    assert assess(calibration).quality == "pass"
+    assert calibration.quality.quality == "pass"
     np.testing.assert_allclose(
         list(calibration.subject.lengths.values()), list(good.subject.lengths.values()), atol=2e-3
     )
 
     calibration = solved(turned(stated.recording(), "left_forearm", over), person)
-    quality = assess(calibration)
+    quality = calibration.quality
     assert quality.quality == "poor"
     (unused,) = calibration.problem.unused_mounts
     assert (unused.code, unused.place, unused.facts) == ("mount-contradicted", "left_forearm", {"variant": "unused"})
@@ -279,23 +244,19 @@ def test_exit_code_and_file_carry_the_quality(
     width = f"shoulder_width={person.measured['shoulder_width']:.4f}"
     words = ["--stature", f"{person.stature:.3f}", "--sex", person.sex]
     for options, wanted, code in ((["--measured", width], "pass", 0), ([], "poor", 3)):
-        with pytest.raises(SystemExit) as stop:
-            main(["calibrate", "session.toml", "-o", wanted, *words, *options])
-        assert int(stop.value.code or 0) == code
+        assert run("calibrate", "session.toml", "-o", wanted, *words, *options) == code
         printed = capsys.readouterr().out
         assert f"Quality: {wanted}" in printed
         assert max(map(len, printed.splitlines())) <= 100
         content = json.loads((tmp_path / wanted / "calibration.json").read_text(encoding="utf-8"))
         assert content["quality"] == wanted
-        warned = [from_json(each) for each in content["diagnostics"] if each["severity"] != "info"]
-        assert bool(warned) == (wanted != "pass")
+        assert any(each["severity"] != "info" for each in content["diagnostics"]) == (wanted != "pass")
         assert all(each["text"]["do"] for each in content["diagnostics"])
         assert {check["quality"] for check in content["checks"]} == {"pass", wanted}
         assert len(content["gap"]["time"]) <= 600
         assert content["mounts"].keys() == anywhere.quat_LS.keys()
         assert content["lengths"]["left_upper_arm"]["std"] > 0.0
         assert {"wepose-pin", "casadi"} <= content["versions"].keys()
-    assert QUALITIES == ("pass", "poor", "fail")
 
 
 def test_a_measured_length_that_is_right_to_a_centimetre_is_not_contradicted() -> None:
@@ -306,4 +267,4 @@ def test_a_measured_length_that_is_right_to_a_centimetre_is_not_contradicted() -
         measured = {name: person.lengths[name] for name in ("shoulder_width", "right_upper_arm")}
         measured["left_upper_arm"] = person.lengths["left_upper_arm"] + error
         calibration = calibrate(recording, measured=measured, prior=person.prior)
-        assert ("length-contradicted" in codes(assess(calibration))) == contradicted
+        assert ("length-contradicted" in codes(calibration.quality)) == contradicted

@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wepose_pin.calibration import calibrate
-from wepose_pin.errors import WeposeError
-from wepose_pin.recording import ImuSensor, Recording
-from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
+from wepose_pin import NOISE_FREE, ImuSensor, Recording, Simulation, WeposeError, calibrate, simulate, simulate_person
 
 
 @pytest.fixture(scope="module")
