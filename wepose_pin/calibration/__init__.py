@@ -3,9 +3,8 @@
 `procedure` is the calibration from a recording to a subject, step by step. `protocols` describes what a person does,
 `conditions` what follows for a body, `problem` collects inputs and samples. `equations` has the unknowns and residuals
 in CasADi, `priors` what is known before, `least_squares` the problem and its solution by `nlpsol`. `initial_headings`
-searches headings without an initial guess, and `couplings` has what accelerations observe of them. `samples` finds the
-samples connected with the start pose, `weights` weighs them. `solution` compares other minima and makes a `result`.
-`alternatives` tries other labels, and leaves out mounts. `quality` assesses the result. `paper` is the published
+searches headings without an initial guess, and `couplings` has what accelerations observe of them. `weights` weighs the
+samples. `solution` compares other minima and makes a `result`. `quality` assesses it. `paper` is the published
 calibration of the lengths alone.
 """
 

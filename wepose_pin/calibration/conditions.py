@@ -1,8 +1,12 @@
-"""A protocol's conditions on a body: what `wepose_pin.observations` observe in each phase."""
+"""A protocol's conditions on a body, and the samples at which a recording observes them.
+
+Samples are used that all sensors measured, and that are connected with the start pose: after lost samples a filter
+recovers the tilt from gravity, but never the heading.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -12,11 +16,14 @@ from ..body import BodyModel
 from ..body.lengths import UNIVERSE
 from ..body.mounts import StartPose
 from ..body.table import Vector
+from ..data_tables import read_columns, read_table
 from ..errors import BadSession
-from ..observations.paths import PointPath, SegmentVector, find_path
-from ..observations.symbols import rotate, rotate_back
+from ..observations.expressions import PointPath, SegmentVector, find_path, rotate, rotate_back
 from ..recording import Recording
+from ..recording.gaps import find_runs
 from .protocols import Closure, Direction, FreeMotion, Protocol
+
+LONGEST_LOSS_S = 0.1  # [s] over which the rate of an arm is interpolated to some degrees
 
 
 @dataclass(frozen=True)
@@ -109,3 +116,63 @@ def is_scale_observed(constraints: Collection[Constraint]) -> bool:
         for loop in constraints
         if isinstance(loop, Loop)
     )
+
+
+# Samples --------------------------------------------------------------------------------------------------------------
+
+
+def find_samples(recording: Recording, intervals: Iterable[tuple[float, float]]) -> np.ndarray:
+    """Return the numbers (n,) of the samples in intervals [s], which may overlap: each sample counts once."""
+    inside = np.zeros(len(recording), dtype=bool)
+    for interval in intervals:
+        inside[recording.span(interval)] = True
+    return np.flatnonzero(inside)
+
+
+def find_connected(
+    recording: Recording, start: tuple[float, float], sensors: Collection[str]
+) -> tuple[np.ndarray, str, tuple[float, float]]:
+    """Find the samples (n,) bool between which and the start pose [s] no sensor lost more than `LONGEST_LOSS_S`.
+
+    Return also the sensor whose loss ends them, else the one after whose loss they begin, and that loss [s]; empty:
+    nothing was lost.
+    """
+    n, begin, longest = len(recording), recording.span(start).start, LONGEST_LOSS_S * recording.rate_hz
+    gaps = {name: recording.imus[name].gap for name in sensors if name in recording.imus}
+    runs = [(a, b, name) for name, gap in gaps.items() if gap is not None for a, b in find_runs(gap)]
+    losses = [(a, b, name) for a, b, name in runs if b - a > longest]
+    before = max((loss for loss in losses if loss[0] < begin), key=lambda loss: loss[1], default=(0, 0, ""))
+    after = min((loss for loss in losses if loss[0] >= begin), default=(n, n, ""))
+    a, b, lost = after if after[2] else before
+    interval = (float(recording.time[a]), float(recording.time[b - 1])) if lost else (np.nan, np.nan)
+    samples = np.arange(n)
+    return (samples >= before[1]) & (samples < after[0]), lost, interval
+
+
+def mask_measured(recording: Recording, sensors: Collection[str], samples: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: all of these sensors measured these samples (n,)."""
+    gaps = [gap[samples] for name in sensors if (gap := recording.sensors[name].gap) is not None]
+    return ~np.any([np.zeros(len(samples), dtype=bool), *gaps], axis=0)
+
+
+def read_recorded_places(recording: Recording, closure: Closure, time: np.ndarray) -> np.ndarray:
+    """Return places (n, 3) [m] in W of the closure's point from its origin at `time` (n,) [s]; NaN where it was lost.
+
+    Places are interpolated linearly between two rows of the session's truth file that both have them. It raises where
+    there is no such file, or its columns and times are not as they should be.
+    """
+    [point] = closure.points
+    columns = [f"{point}_{axis}" for axis in "xyz"]
+    if recording.truth is None:
+        raise BadSession(
+            f"{recording.where()}: data.truth is missing; this protocol takes the place of {point} from it, a table "
+            f"with the columns time, {', '.join(columns)}"
+        )
+    table, file, where = read_table(recording.truth), str(recording.truth), f"{recording.where()}: data.truth"
+    known_time = read_columns(table, ["time"], file, where)[:, 0]
+    places = read_columns(table, columns, file, where)
+    if closure.origin:
+        places = places - read_columns(table, [f"{closure.origin}_{axis}" for axis in "xyz"], file, where)
+    if not (np.diff(known_time) > 0.0).all():
+        raise BadSession(f"{where}: time of {recording.truth.name} does not increase from row to row")
+    return np.column_stack([np.interp(time, known_time, column, left=np.nan, right=np.nan) for column in places.T])

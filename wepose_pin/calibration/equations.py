@@ -37,9 +37,16 @@ from ..body import BodyTable
 from ..body.girdle import PARAMETERS
 from ..body.soft_tissue import LEAST_TWIST_COSINE
 from ..body.table import Vector
-from ..observations.hinges import HingePlane
-from ..observations.paths import GirdleTerm, express_covariance, express_path
-from ..observations.symbols import about_z, product, rotate_back, small_rotation
+from ..observations.expressions import (
+    GirdleTerm,
+    HingePlane,
+    about_z,
+    express_covariance,
+    express_path,
+    product,
+    rotate_back,
+    small_rotation,
+)
 from .conditions import Constraint, Level, Loop, Pointing
 from .protocols import FreeMotion
 

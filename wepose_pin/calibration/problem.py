@@ -23,16 +23,23 @@ from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
-from ..observations.hinges import find_hinges
+from ..observations.expressions import ZERO_LENGTH, find_girdles, find_hinges
 from ..observations.joint_accelerations import find_neighbours
-from ..observations.paths import ZERO_LENGTH, find_girdles
 from ..recording import Intervals, Recording, format_span
-from .conditions import Constraint, Loop, Pointing, resolve_conditions
+from .conditions import (
+    Constraint,
+    Loop,
+    Pointing,
+    find_connected,
+    find_samples,
+    mask_measured,
+    read_recorded_places,
+    resolve_conditions,
+)
 from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations
 from .protocols import Closure, Condition, FreeMotion, Protocol
-from .samples import find_connected, find_samples, mask_measured, read_recorded_places
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -42,11 +43,10 @@ from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..recording import Recording
-from .alternatives import exchange_labels, leave_out_mounts
 from .paper import Formulation, solve_paper_calibration
 from .problem import CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
-from .quality import assess
+from .quality import LEAST_ROTATION, assess, measure_doubt, measure_rotations
 from .result import Calibration
 from .solution import solve_problem
 
@@ -54,6 +54,7 @@ from .solution import solve_problem
 MEASURED_STD = 0.003
 LEAST_STD = 1e-6  # [m] keeps covariances of what is known exactly invertible
 MEASURED_RANGE = 0.02, 1.0  # [m] of lengths that a user may measure
+BETTER = 0.6  # times the doubt of the stated labels, below which another labelling is the true one
 
 
 def calibrate(
@@ -185,6 +186,42 @@ def solve_plausible(problem: CalibrationProblem) -> Calibration:
         return quick if quick.exchanged else solve_problem(quick.problem)
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error
+
+
+def leave_out_mounts(stated: Calibration) -> Calibration:
+    """Return the quick solution without the mounts that the motion contradicts."""
+    problem = stated.problem
+    contradicted = problem.leave_out_mounts(stated.subject.mounts).unused_mounts != problem.unused_mounts
+    if measure_doubt(stated)[0] <= 1.0 and not contradicted:
+        return stated
+    free = solve_problem(problem.remove_mounts(problem.filtered.R_VS), quick=True)
+    without = problem.leave_out_mounts(free.subject.mounts)
+    if without.unused_mounts == problem.unused_mounts or measure_doubt(free)[0] >= 1.0:
+        return stated
+    return solve_problem(without, quick=True)
+
+
+def exchange_labels(stated: Calibration) -> Calibration:
+    """Return the quick solution with two sensors, or both sides, exchanged if the limbs move as a person's then.
+
+    Joined hands close the chain for some exchanged sensors as well: left for right, or upper arm for forearm of a side,
+    give the same gap. The solution's elbows then bend backward, or sideways, as a person's cannot. Any other exchange
+    opens the chain.
+    """
+    problem, (doubt, _), table = stated.problem, measure_doubt(stated), stated.problem.model.table
+    rotations = [*measure_rotations(stated).values()]
+    if doubt <= 1.0 or table.is_mechanism or not rotations or np.median(rotations) < LEAST_ROTATION:
+        return stated
+    places = [name for name in problem.sensors if name in table.needed]
+    sides = [(a, b) for a, b in table.pairs.items() if {a, b} <= set(places)]
+    exchanges = [dict((pair, pair[::-1])) for pair in combinations(places, 2)]
+    exchanges.append({a: b for pair in sides for a, b in (pair, pair[::-1])})
+    doubts = [measure_doubt(solve_problem(problem.relabel(labels), quick=True))[0] for labels in exchanges]
+    least = min(doubts)
+    if least >= min(1.0, BETTER * doubt):
+        return stated
+    subject = replace(stated.subject, note="sensors sit elsewhere than labelled")
+    return replace(stated, subject=subject, remarks=(), exchanged=exchanges[doubts.index(least)])
 
 
 def separate_mounts(earlier: Subject, population: Subject) -> Subject:

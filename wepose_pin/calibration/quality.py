@@ -12,12 +12,12 @@ from dataclasses import replace
 from typing import get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..body.subject import Quality
 from ..body.table import ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences
 from ..recording import format_span
-from .alternatives import LEAST_ROTATION, measure_doubt, measure_rotations
 from .conditions import is_scale_observed
 from .result import MIN_CONTACT, Calibration, CalibrationQuality, Check, QualityLimits
 from .weights import CONTRADICTED
@@ -38,6 +38,13 @@ OTHER_HEADING = QualityLimits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] of a h
 # Relative. It may move a hand, 0.62 m from its shoulder, by half of what tissue and girdle do, 15 mm: 2.4 %. A taped
 # arm gives 1.2 %, shoulder breadth with stature and sex 2.1 %, stature and sex alone 2.6 %, the population prior 5 %.
 SCALE = QualityLimits(0.024, 0.08)
+# Limits of a person's limbs, with soft tissue and headings some degrees off.
+BACKWARD = 0.15  # share of samples out of a hinge's range
+SIDEWAYS = np.deg2rad(14.0)  # [rad] rms of a segment off the plane in which it bends
+OPEN = 0.06  # [m] rms of the gap
+# [rad] by which segments turn at least, `measure_rotations`. Soft tissue alone gives people 4 deg, a minute of joined
+# hands 36 to 39 deg.
+LEAST_ROTATION = np.deg2rad(8.0)
 # Residuals of the solution.
 # [m] rms while the palms touch: wrists bend, shoulders travel. Careful simulated people have 39 mm, give or take 5, and
 # those with more are no farther off.
@@ -199,3 +206,35 @@ def format_longest(intervals: Sequence[tuple[float, float]]) -> str:
     """The text of the longest intervals [s], in the order of time."""
     longest = sorted(intervals, key=lambda interval: interval[0] - interval[1])[:MOST_INTERVALS]
     return ", ".join(format_span(np.round(interval, 1) + 0.0) for interval in sorted(longest))  # no negative zero
+
+
+def measure_rotations(calibration: Calibration) -> dict[str, float]:
+    """Segment → how far it turned [rad] while the closure held, the rms angle from its mean; empty without one."""
+    if not calibration.closed.any():
+        return {}
+    R = {name: Rotation.from_quat(quat[calibration.closed]) for name, quat in calibration.quat_WL.items()}
+    return {name: float(np.sqrt(np.mean((each.mean().inv() * each).magnitude() ** 2))) for name, each in R.items()}
+
+
+def measure_doubt(calibration: Calibration) -> tuple[float, str]:
+    """Return the largest ratio of the limbs' motion to a limit, above 1 where a person cannot move so, and its joint.
+
+    It is that while the closure held; without a closure, that of all samples. The gap has no joint.
+    """
+    table, closed = calibration.problem.model.table, calibration.closed
+    samples, doubts = np.ones(len(closed), dtype=bool), [(0.0, "")]
+    if closed.any():
+        samples = calibration.touching
+        gap = np.sqrt(np.average(calibration.gap[closed] ** 2, weights=calibration.contact[closed]))
+        doubts.append((float(gap) / OPEN, ""))
+    R = {name: Rotation.from_quat(quat[samples]) for name, quat in calibration.quat_WL.items()}
+    for joint, hinge in table.hinges.items():
+        if hinge.on in R and hinge.moves in R:
+            straight, axis = np.array(table.segments[hinge.on].along), np.array(hinge.axis)
+            along = (R[hinge.on].inv() * R[hinge.moves]).apply(table.segments[hinge.moves].along)
+            angle = np.arctan2(np.cross(straight, along) @ axis, along @ straight)
+            low, high = hinge.range
+            off_plane = np.linalg.svd(along, compute_uv=False)[-1] / np.sqrt(len(along))
+            doubts.append((float(np.mean((angle < low) | (angle > high))) / BACKWARD, joint))
+            doubts.append((float(off_plane) / SIDEWAYS, joint))
+    return max(doubts, key=lambda doubt: doubt[0])

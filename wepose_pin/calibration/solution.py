@@ -47,14 +47,8 @@ NEAR = 3.0  # standard deviations within which two solutions are the same
 def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibration:
     """Return the calibration, with other minima that explain the motion nearly as well.
 
-    Parameters
-    ----------
-    quick : at fewer samples and by the closure alone, which shows whether mounts and labels can be as stated
-
-    Raises
-    ------
-    NoSolution
-        It did not converge, or a length is at its bound; not where it is quick.
+    `quick`: at fewer samples and by the closure alone, which shows whether mounts and labels can be as stated. Else
+    `NoSolution` is raised where it did not converge, or where a length is at its bound.
     """
     observations, samples = problem.observe(QUICK_RATE_HZ if quick else SAMPLE_RATE_HZ)
     layout, (prior_mean, information) = observations.layout, build_prior(problem, observations)
@@ -96,11 +90,7 @@ def include_other_minima(
     A covariance describes one minimum. Where the hands hardly move, the closure has several: one arm's headings turned
     by 118 deg close the chain as well. Each is solved and weighted by how much worse it explains all that is known.
 
-    Parameters
-    ----------
-    result, covariance : the best solution
-    headings : (k, sensors) [rad] of the other minima, the lowest first
-    prior_at : headings (sensors,) → what is known without the closure; those without a stated mount are its mean
+    `headings` (k, sensors) [rad] are those of the other minima, the lowest first; `prior_at` gives the prior at some.
     """
     fit = result.fit
     observations, rows = fit.observations, fit.observations.layout.heading

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from ..body.mounts import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
-from ..observations.hinges import linearize_hinge
+from ..observations.expressions import linearize_hinge
 from ..observations.joint_accelerations import linearize_joint
 from .heading_problem import HeadingProblem
 

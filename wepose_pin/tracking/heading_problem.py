@@ -19,9 +19,8 @@ from ..body.subject import Subject
 from ..calibration import load_protocol
 from ..errors import BadSession
 from ..filters.noise import SensorNoise
-from ..observations.hinges import HingePlane, find_hinges
+from ..observations.expressions import HingePlane, PointPair, find_hinges
 from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
-from ..observations.paths import PointPair
 from ..recording import Recording
 
 CLASP = "clasp"  # the phase in which the palms are joined, and its protocol
