@@ -12,22 +12,15 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import polars as pl
 import pytest
 from commands import options, run
 
-from benchmarks.results import adapter
-from wepose_pin import __version__, calibration, load_subject
-from wepose_pin.calibration import PROTOCOLS
+import wepose_pin as wp
+from wepose_pin import Recording, Simulation, __version__, load_subject
 from wepose_pin.commands.command_line import COMMANDS, parse
-from wepose_pin.commands.options import Formulation, LiveMethod, Method
-from wepose_pin.filters import METHODS, OFFLINE
-from wepose_pin.recording import Recording
-from wepose_pin.simulation import Simulation, simulate
-from wepose_pin.simulation.motion import TASKS
 from wepose_pin.writers import write_session
 
 
@@ -72,14 +65,6 @@ def test_help_is_grouped(capsys: pytest.CaptureFixture[str]) -> None:
     assert places == sorted(places)
 
 
-def test_choices_of_options_are_those_of_the_rooms() -> None:
-    """Options are annotated without loading a room; what is added there must be added here."""
-    assert get_args(Method) == tuple(METHODS) == adapter.METHODS
-    assert get_args(Formulation) == get_args(calibration.Formulation)
-    assert get_args(LiveMethod) == tuple(name for name in METHODS if name not in OFFLINE)
-    assert set(TASKS) <= set(PROTOCOLS)
-
-
 def test_words_become_arguments() -> None:
     words = "calibrate s.toml --measured biacromial=0.4 --protocol table --measured trunk=0.5 --sex f -o out"
     command, bound = parse(words.split())
@@ -101,7 +86,7 @@ def test_demo_makes_all_of_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On half a minute of clasp and two circles in place of a minute and six, as .ci/run runs it."""
-    monkeypatch.setattr("wepose_pin.simulation.simulate", partial(simulate, clasp_s=30.0, circles=2))
+    monkeypatch.setattr("wepose_pin.simulation.simulate", partial(wp.simulate, clasp_s=30.0, circles=2))
     assert run("demo", "-o", tmp_path / "demo", "--seed", 2) == 0
     text = capsys.readouterr().out
     for word in ("left forearm", "measured", "true", "view.html"):

@@ -22,7 +22,6 @@ import wepose_pin
 from wepose_pin.calibration import load_protocol
 from wepose_pin.commands.command_line import COMMANDS
 from wepose_pin.filters import TYPICAL
-from wepose_pin.readers.registry import read_device
 from wepose_pin.retargeting.maps import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -177,13 +176,13 @@ def test_the_description_of_the_recipe_is_read(tmp_path: Path) -> None:
     file = tmp_path / "torso.csv"
     rows = "0;180;0;0;0;0;1000\n10;0;0;90;0;0;1000\n20;0;0;90;0;0;1000\n"
     file.write_text(f"serial: A17\nt_ms;wx;wy;wz;fx;fy;fz\n{rows}", encoding="utf-8")
-    device = read_device(file, str(example("wepose_pin/readers/formats/acme.toml", tmp_path)))
-    assert list(device.sensors) == ["A17"]
-    sensor = device.sensors["A17"]
-    assert sensor.segment == "torso"
-    np.testing.assert_array_equal(sensor.time, [0.0, 0.01, 0.02])
-    np.testing.assert_allclose(sensor.signals["gyro"][:2], [[np.pi, 0, 0], [0, 0, np.pi / 2]])
-    np.testing.assert_allclose(sensor.signals["accel"][:, 2], 9.80665)
+    example("wepose_pin/readers/formats/acme.toml", tmp_path)
+    (tmp_path / "session.toml").write_text('[data]\nfile = "torso.csv"\nformat = "acme.toml"\n[sensors.torso]\n')
+    recording = wepose_pin.load_session(tmp_path)
+    np.testing.assert_allclose(recording.time, [0.0, 0.01, 0.02])
+    sensor = recording.sensors["torso"]
+    np.testing.assert_allclose(sensor.gyro_S[:2], [[np.pi, 0, 0], [0, 0, np.pi / 2]])
+    np.testing.assert_allclose(sensor.accel_S[:, 2], 9.80665)
 
 
 def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> None:

@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 import wepose_pin
-from wepose_pin.body import load_table
 
 PACKAGE = Path(wepose_pin.__file__).parent
-TABLE = load_table("whole_body")  # the upper body's names and those of legs
+TABLE = wepose_pin.load_model("whole_body").table  # the upper body's names and those of legs
 NAMES = {*TABLE.segments, *TABLE.points, *TABLE.lengths, *TABLE.hinges}
 PARTS = {TABLE.shared_name(name) for name in NAMES if TABLE.side(name)}
 # A name on its own, or a part of one, from which a name is built: "left_palm_x", f"{side}_forearm", "%s_hand", "left_".
