@@ -12,9 +12,7 @@ from device_files import ACCEL, GYRO, TIME, N
 from test_info import info
 
 import wepose_pin as wp
-from wepose_pin.data_tables import read_layout, read_table
 from wepose_pin.errors import BadData
-from wepose_pin.readers.guess import guess_columns
 from wepose_pin.recording import Recording
 
 G = 9.80665
@@ -156,26 +154,6 @@ def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFix
         wp.load_session(tmp_path / "session.toml", gaps=True)
 
 
-@pytest.mark.parametrize(
-    ("text", "separator", "names", "rows"),
-    [
-        ('"sep=;"\na;b;\nms;m/(s^2);\n1;2;\n2;3;\n', ";", ("a", "b", ""), [(1.0, 2.0, None), (2.0, 3.0, None)]),
-        ("t\tx\n0\t1,5\n1\t2\n", "\t", ("t", "x"), [(0.0, 1.5), (1.0, 2.0)]),
-        ("Export;;\nDate;2024;\nt;x;y\n1;2;3\n", ";", ("t", "x", "y"), [(1.0, 2.0, 3.0)]),
-        ("# a\n\n# b\nt,x\n1,2\n", ",", ("t", "x"), [(1.0, 2.0)]),
-        ("a,b\nx,y\n1,2\n", ",", ("a", "b"), [("x", "y"), ("1", "2")]),  # text is an error in the place that reads it
-        ("t;x\n1;-1,5e-3\n2;3,\n", ";", ("t", "x"), [(1.0, -0.0015), (2.0, 3.0)]),
-    ],
-)
-def test_layouts(
-    text: str, separator: str, names: tuple[str, ...], rows: list[tuple[object, ...]], tmp_path: Path
-) -> None:
-    (tmp_path / "a.csv").write_text(text)
-    layout = read_layout(tmp_path / "a.csv")
-    assert (layout.separator, tuple(layout.names)) == (separator, names)
-    assert read_table(tmp_path / "a.csv").rows() == rows
-
-
 def test_a_file_for_each_sensor_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Not the other recording of the same name, nor a table of something else."""
     names = ",".join(["t_ms", *(f"{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])
@@ -195,29 +173,27 @@ def test_a_rate_that_the_file_states(data: Path, capsys: pytest.CaptureFixture[s
     assert "the file says 'sampling frequency: 40'" in out
 
 
-def test_axes_anywhere_in_a_name() -> None:
-    """Numbers are those of sensors while letters are axes."""
-    imus = [f"imu{s}_{k}_{a}" for s in range(3) for k in ("acc", "gyro") for a in "xyz"]
-    assert list(guess_columns(imus).sensors) == ["?imu0", "?imu1", "?imu2"]
-    guess = guess_columns([f"{k}[{a}]" for k in ("ACC", "GYR") for a in range(3)])
-    assert guess.sensors == {"?": {"accel": [f"ACC[{a}]" for a in range(3)], "gyro": [f"GYR[{a}]" for a in range(3)]}}
-    noraxon = [f"Forearm RT {k} Sensor {a} (mG)" for k in ("Accel", "Gyro") for a in "XYZ"]
-    assert list(guess_columns(noraxon).sensors) == ["right_forearm"]
-    phone = ["Linear Acceleration x", "Linear Acceleration y", "Linear Acceleration z"]
-    assert guess_columns([*phone, "gx", "gy", "gz"]).sensors == {}
-
-
-def test_columns_by_their_names() -> None:
-    names = (
-        "Time (s),chest_gyro_x [deg/s],chest_gyro_y [deg/s],chest_gyro_z [deg/s],chest_acc_x,chest_acc_y,chest_acc_z"
-    )
-    guess = guess_columns([*names.split(","), "chest_mag_x", "chest_mag_y", "chest_mag_z", "left_wrist_qw"])
-    assert guess.times == ["Time (s)"]
-    assert guess.units == {"Time (s)": "s", "gyro": "deg/s"}
-    assert list(guess.sensors) == ["torso"]
-    assert guess.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
-    guess = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
-    assert guess.sensors == {"?": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
-    guess = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
-    assert guess.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
-    assert guess_columns(["a", "b", "velocity_x"]).sensors == {}
+@pytest.mark.parametrize(
+    ("names", "sensors", "columns"),
+    [
+        (  # numbers are those of sensors while letters are axes
+            [f"imu{s}_{k}_{a}" for s in range(3) for k in ("acc", "gyro") for a in "xyz"],
+            "imu0 imu1 imu2",
+            '"imu0_gyro_x", "imu0_gyro_y", "imu0_gyro_z"',
+        ),
+        ([f"{k}[{a}]" for k in ("ACC", "GYR") for a in range(3)], "SEGMENT", '"GYR[0]", "GYR[1]", "GYR[2]"'),
+        ([f"chest_{k}_{a}" for k in ("acc", "gyro", "mag") for a in "xyz"], "[sensors.torso]", '"chest_acc_x", '),
+        (["ax", "ay", "az", "gx", "gy", "gz"], "SEGMENT", '"ax", "ay", "az"'),
+        (["head_q0", "head_q1", "head_q2", "head_q3"], "[sensors.head]", '"head_q1", "head_q2", "head_q3", "head_q0"'),
+        ([*(f"Linear Acceleration {a}" for a in "xyz"), "gx", "gy", "gz"], "", ""),
+    ],
+)
+def test_columns_by_their_names(
+    names: list[str], sensors: str, columns: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    table = np.column_stack([values(k) for k in range(3)])[:, : len(names)]
+    (tmp_path / "a.csv").write_text(",".join(["t", *names]) + "\n" + lines([str(t) for t in TIME], table, ","))
+    text = info(capsys, tmp_path / "a.csv")
+    assert all(each in text for each in sensors.split())
+    assert columns in text
+    assert ("no gyroscope and accelerometer" in text) == (not sensors)
