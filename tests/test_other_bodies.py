@@ -144,8 +144,8 @@ def test_knees_bend_forwards_and_toes_are_seen_from_the_hips(tracked: TrackResul
     table = tracked.model.table
     knee = measure_hinge(tracked.pose, table, "left_knee")
     assert knee is not None
-    np.testing.assert_allclose(np.degrees(knee.flexion), flexion, atol=0.01)
-    np.testing.assert_allclose(knee.aside, 0.0, atol=1e-4)
+    np.testing.assert_allclose(np.degrees(knee[1]), flexion, atol=0.01)
+    np.testing.assert_allclose(knee[2], 0.0, atol=1e-4)
     tips = measure_tips(tracked.pose, 50.0, table)
     assert set(tips) == {"left_toe", "right_toe"}
     np.testing.assert_allclose(tips["left_toe"].reach[0], [FOOT, HIP, -THIGH - SHANK], atol=1e-6)

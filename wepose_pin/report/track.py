@@ -12,8 +12,6 @@ from ..body import BodyTable
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (
-    HeadingStd,
-    Measures,
     Signal,
     TipMotion,
     compute_joint_heading_stds,
@@ -59,7 +57,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
     summary : of `summarize`
     view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
     """
-    tracked, measures = summary.tracked, summary.measures
+    tracked, measures = summary.tracked, summary
     recording, table = tracked.recording, tracked.model.table
     angles = None
     with contextlib.suppress(BadData):  # no joint has both of its segments
@@ -89,7 +87,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
 # Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _describe_reliance(tracked: TrackResult, measures: Measures, angles: Angles | None) -> str:
+def _describe_reliance(tracked: TrackResult, measures: TrackSummary, angles: Angles | None) -> str:
     """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
     after_start, table = find_samples_after_start(tracked), tracked.model.table
     stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
@@ -121,7 +119,7 @@ def _explain_no_covariance(tracked: TrackResult) -> str:
     )
 
 
-def _describe_recording(tracked: TrackResult, measures: Measures) -> str:
+def _describe_recording(tracked: TrackResult, measures: TrackSummary) -> str:
     recording, time = tracked.recording, tracked.time
     text = (
         f"{recording.time[-1] - recording.time[0]:.0f} s at {measures.rate_hz:g} Hz from "
@@ -141,7 +139,7 @@ def _describe_recording(tracked: TrackResult, measures: Measures) -> str:
     return text
 
 
-def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
+def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     rate_hz, rows = tracked.recording.rate_hz, []
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in tracked.recording.phases.items())
     for name, signal in measures.signals.items():
@@ -167,8 +165,8 @@ def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
     ]
 
 
-def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> list[Item]:
-    if not headings:
+def _list_drift(tracked: TrackResult, stds: Mapping[str, np.ndarray]) -> list[Item]:
+    if not stds:
         return [_explain_no_covariance(tracked)]
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
     text = (
@@ -181,12 +179,11 @@ def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> lis
             f" What the joints and joined hands show corrected the headings by up to {most:.1f}°. This does not "
             "correct errors that all segments share, such as the heading of the whole person."
         )
-    stds = {name: heading.std for name, heading in headings.items()}
     rows = []
-    for name, std in [*stds.items(), *compute_joint_heading_stds(headings, tracked.model).items()]:
+    for name, std in [*stds.items(), *compute_joint_heading_stds(stds, tracked.model).items()]:
         ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
         rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends)])
-    sides = {side: [name for name in headings if table.side(name) == side] for side in map(table.side, headings)}
+    sides = {side: [name for name in stds if table.side(name) == side] for side in map(table.side, stds)}
     figure = draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
@@ -197,7 +194,7 @@ def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> lis
     return [text, figure, Table("", ["segment or joint", "median ±", "largest ±", "± at the end"], rows)]
 
 
-def _list_tips(tracked: TrackResult, measures: Measures) -> list[Item]:
+def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
     items: list[Item] = list(draw_tips(tracked.time, measures.tips, table).values())
     for title, tips in group_tips(measures.tips, table).items():

@@ -8,8 +8,7 @@ lengths, and the headings of segments, whose correlations go to the parts of the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -44,42 +43,12 @@ class Signal(NamedTuple):
     bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
 
 
-class HeadingStd(NamedTuple):
-    """The uncertainty of a segment's heading, one standard deviation (n,) [rad]."""
-
-    std: np.ndarray  # with start pose, soft tissue and the heading correction
-    drift: np.ndarray  # of the filter alone; with a heading correction at most what that leaves
-
-
-class HingeMotion(NamedTuple):
-    """A hinge over time, from the directions of its two segments; NaN where one of them is not known."""
-
-    bend: np.ndarray  # (n,) [rad] between the two, 0 in line
-    flexion: np.ndarray  # (n,) [rad], the bend in the plane of the hinge; negative: against the way it bends
-    aside: np.ndarray  # (n,) [rad], the moving segment out of that plane
-    extended: float  # [rad] least flexion of the hinge's range
-
-
 class TipMotion(NamedTuple):
     """The motion of a point whose path is drawn, as of a hand."""
 
     reach: np.ndarray  # (n, 3) [m] from the origin of its limb, in the segment on which that hangs; NaN: not known
     std: np.ndarray | None  # (n,) [m], one axis, from the root; None where the filter has no covariance
     peak_speed: float  # [m/s]
-
-
-@dataclass(frozen=True)
-class Measures:
-    """All measures of a tracked recording."""
-
-    samples: int  # of the recording
-    rate_hz: float  # of its samples
-    steps_ms: tuple[float, float]  # shortest and longest step between samples
-    signals: Mapping[str, Signal]  # of each sensor
-    headings: Mapping[str, HeadingStd]  # of each segment whose filter has a covariance
-    hinges: Mapping[str, HingeMotion]
-    tips: Mapping[str, TipMotion]  # of each point whose path is drawn
-    error_budget: Mapping[str, Mapping[str, float]]  # as `compute_error_budget`
 
 
 def measure_signal(
@@ -110,9 +79,13 @@ def measure_signal(
     )
 
 
-def measure_headings(tracked: TrackResult) -> dict[str, HeadingStd]:
-    """Segment → uncertainty of its heading; none where there is no filter, or it has no covariance."""
-    headings, correction = {}, tracked.correction
+def compute_heading_stds(tracked: TrackResult) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Compute segment → one standard deviation (n,) [rad] of its heading, and of the drift of its filter alone.
+
+    The first includes start pose, soft tissue and the heading correction; with that the drift is at most what it
+    leaves. There is none without a filter, or where that has no covariance.
+    """
+    stds, drifts, correction = {}, {}, tracked.correction
     for name, cov_W in tracked.pose.segment_cov.items():
         orientation = tracked.segments.orientation.get(name)
         if orientation is None or orientation.attitude_cov is None:
@@ -121,45 +94,44 @@ def measure_headings(tracked: TrackResult) -> dict[str, HeadingStd]:
         if correction is not None and len(correction.time) and name in correction.segments:
             i = correction.segments.index(name)
             drift = np.minimum(drift, np.sqrt(np.interp(tracked.time, correction.time, correction.covariance[:, i, i])))
-        headings[name] = HeadingStd(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift)
-    return headings
+        stds[name], drifts[name] = np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift
+    return stds, drifts
 
 
-def compute_joint_heading_stds(
-    headings: Mapping[str, HeadingStd], model: BodyModel, part: Literal["std", "drift"] = "std"
-) -> dict[str, np.ndarray]:
-    """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent.
-
-    `part` "drift": without start pose and soft tissue.
-    """
+def compute_joint_heading_stds(stds: Mapping[str, np.ndarray], model: BodyModel) -> dict[str, np.ndarray]:
+    """Joint → (n,) [rad] of the heading between its segments, as if `stds` of these were independent."""
     return {
-        model.table.joint_name(segment): np.hypot(*(getattr(headings[name], part) for name in (above, segment)))
+        model.table.joint_name(segment): np.hypot(stds[above], stds[segment])
         for segment, above in model.parents.items()
-        if above is not None and {above, segment} <= set(headings)
+        if above is not None and {above, segment} <= set(stds)
     }
 
 
-def measure_hinge(pose: Pose, table: BodyTable, name: str, subject: Subject | None = None) -> HingeMotion | None:
-    """A hinge of the table; None where a segment is not known. Without a calibrated axis it has that of the table."""
+def measure_hinge(
+    pose: Pose, table: BodyTable, name: str, subject: Subject | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Measure a hinge of the table; None where a segment is not known.
+
+    Without a calibrated axis it has that of the table.
+
+    Returns
+    -------
+    bend : (n,) [rad] between the directions of the two segments, 0 in line
+    flexion : (n,) [rad] the bend in the plane of the hinge; negative: against the way it bends
+    aside : (n,) [rad] the moving segment out of that plane
+    """
     hinge = table.hinges[name]
-    names = hinge.on, hinge.moves
-    if not set(names) <= set(pose.quat_WL):
+    if not {hinge.on, hinge.moves} <= set(pose.quat_WL):
         return None
-    known: np.ndarray = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in names], axis=0)
-    if not known.any():
-        return None
-    R_on, R_moves = (_rotations(pose.quat_WL[segment], known) for segment in names)
-    along_on, along_moves = (np.array(table.segments[segment].along) for segment in names)
+    R_on, R_moves = (Rotation.from_quat(pose.quat_WL[segment]) for segment in (hinge.on, hinge.moves))
+    along_on, along_moves = (np.array(table.segments[segment].along) for segment in (hinge.on, hinge.moves))
     axis = np.array(hinge.axis) if subject is None or name not in subject.hinges else subject.hinges[name].axis
-    sign = -1.0 if sum(hinge.range) < 0.0 else 1.0  # it bends to the wider end of its range
-    flexed = sign * np.cross(axis, along_on)  # where the moving segment points at 90° of flexion
+    # Where the moving segment points at 90° of flexion: it bends to the wider end of its range.
+    flexed = (-1.0 if sum(hinge.range) < 0.0 else 1.0) * np.cross(axis, along_on)
     moves = R_on.inv().apply(R_moves.apply(along_moves))
     bend = np.arctan2(np.linalg.norm(np.cross(along_on, moves), axis=1), moves @ along_on)
     flexion = np.arctan2(moves @ (flexed / np.linalg.norm(flexed)), moves @ along_on)
-    aside = np.arcsin(np.clip(moves @ axis, -1.0, 1.0))
-    for values in (bend, flexion, aside):
-        values[~known] = np.nan
-    return HingeMotion(bend, flexion, aside, min(sign * end for end in hinge.range))
+    return bend, flexion, np.arcsin(np.clip(moves @ axis, -1.0, 1.0))
 
 
 def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipMotion]:
@@ -171,7 +143,8 @@ def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipM
         reach = pose.points[name] - np.mean([pose.points[point] for point in limb.origin], axis=0)
         if limb.base is not None:
             known = np.isfinite(pose.quat_WL[limb.base]).all(axis=1)
-            reach = _rotations(pose.quat_WL[limb.base], known).inv().apply(reach)
+            quat = np.where(known[:, None], pose.quat_WL[limb.base], [0.0, 0.0, 0.0, 1.0])
+            reach = Rotation.from_quat(quat).inv().apply(reach)
             reach[~known] = np.nan
         if not np.isfinite(reach).all(axis=1).any():
             continue
@@ -180,11 +153,6 @@ def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipM
         std = compute_axis_std(pose.point_cov[name]) if name in pose.point_cov else None
         tips[name] = TipMotion(reach, std, peak * rate_hz / size)
     return tips
-
-
-def _rotations(quat: np.ndarray, known: np.ndarray) -> Rotation:
-    """Rotations of quaternions (n, 4), the identity where they are not `known`."""
-    return Rotation.from_quat(np.where(known[:, None], quat, [0.0, 0.0, 0.0, 1.0]))
 
 
 def find_samples_after_start(tracked: TrackResult) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,14 +16,14 @@ from ..recording.gaps import find_runs
 from .heading_problem import find_start_variances
 from .measures import (
     PEAK_OVER_S,
-    Measures,
     Signal,
+    TipMotion,
     compute_error_budget,
+    compute_heading_stds,
     compute_joint_heading_stds,
     find_samples_after_start,
     finite_max,
     longest_run_s,
-    measure_headings,
     measure_hinge,
     measure_signal,
     measure_tips,
@@ -48,20 +48,18 @@ LASTING_S = 1.0
 
 @dataclass(frozen=True)
 class TrackSummary:
-    """The summary of a tracked recording.
+    """The summary of a tracked recording: what ``summary.json``, the user and the pages are told."""
 
-    Parameters
-    ----------
-    content : of ``summary.json``: inputs, options and results
-    diagnostics : what the user should know, the gravest first; `content` has them too
-    tracked : the samples that pages show, as if the recording had been so slow
-    measures : what pages state
-    """
-
-    content: dict[str, Any]
-    diagnostics: tuple[Diagnostic, ...]
-    tracked: TrackResult
-    measures: Measures
+    content: dict[str, Any]  # of ``summary.json``: inputs, options and results
+    diagnostics: tuple[Diagnostic, ...]  # what the user should know, the gravest first; `content` has them too
+    tracked: TrackResult  # the samples that pages show, as if the recording had been so slow
+    samples: int  # of the recording
+    rate_hz: float  # of its samples
+    steps_ms: tuple[float, float]  # shortest and longest step between samples
+    signals: Mapping[str, Signal]  # of each sensor
+    headings: Mapping[str, np.ndarray]  # segment → (n,) [rad] one standard deviation, where the filter has a covariance
+    tips: Mapping[str, TipMotion]  # of each point whose path is drawn
+    error_budget: Mapping[str, Mapping[str, float]]  # as `compute_error_budget`
 
 
 def summarize(tracked: TrackResult) -> TrackSummary:
@@ -126,6 +124,7 @@ class SummaryAccumulator:
         last, n, every = self.last, len(self._recording), self._every
         recording = self._recording.cut(slice(n - self._samples, n))
         orientation = {segment: join_orientations(parts) for segment, parts in self._orientations.items()}
+        static = {segment: np.concatenate(parts) for segment, parts in self._static.items()}
         shown = replace(
             recording,
             time=recording.time[::every],
@@ -134,42 +133,40 @@ class SummaryAccumulator:
         )
         source = replace(last.segments, recording=shown, orientation=orientation)
         tracked = replace(last, pose=join_poses(self._poses), source=source)
-        measures = self._measure(tracked, recording)
         residual_rms = {name: float(np.sqrt(squares / self._samples)) for name, squares in self._residual.items()}
+        signals = {
+            name: measure_signal(recording, name, orientation.get(name), static.get(name), every)
+            for name in recording.sensors
+        }
+        stds, drifts = compute_heading_stds(tracked)
+        tips = measure_tips(tracked.pose, tracked.recording.rate_hz, tracked.model.table)
         diagnostics = (*last.segments.diagnostics, *last.model.diagnostics, *_diagnose_model(last, residual_rms))
-        diagnostics = merge(diagnostics, _diagnose_motion(tracked, measures))
+        diagnostics = merge(diagnostics, _diagnose_motion(tracked, signals, drifts))
         ordered = tuple(gravest_first(drop_consequences(diagnostics)))
-        return TrackSummary(self._compose(measures, residual_rms, ordered), ordered, tracked, measures)
-
-    def _measure(self, tracked: TrackResult, recording: Recording) -> Measures:
-        """All measures: `tracked` has the samples that are shown, `recording` all of them."""
-        table, orientation = tracked.model.table, tracked.segments.orientation
-        static = {segment: np.concatenate(parts) for segment, parts in self._static.items()}
-        subject = replace(tracked.subject, hinges=tracked.subject.turn_hinges(tracked.model))
-        hinges = {name: measure_hinge(tracked.pose, table, name, subject) for name in table.hinges}
-        tips = measure_tips(tracked.pose, tracked.recording.rate_hz, table)
-        steps = 1e3 * np.diff(recording.time)
-        return Measures(
-            len(recording),
-            recording.rate_hz,
-            (float(steps.min()), float(steps.max())),
-            {
-                name: measure_signal(recording, name, orientation.get(name), static.get(name), self._every)
-                for name in recording.sensors
-            },
-            measure_headings(tracked),
-            {name: motion for name, motion in hinges.items() if motion is not None},
-            {name: tip._replace(peak_speed=self._peak_speed[name]) for name, tip in tips.items()},
-            compute_error_budget(tracked),
+        budget, steps = compute_error_budget(tracked), 1e3 * np.diff(recording.time)
+        return TrackSummary(
+            content=self._compose(recording, static, residual_rms, budget, ordered),
+            diagnostics=ordered,
+            tracked=tracked,
+            samples=len(recording),
+            rate_hz=recording.rate_hz,
+            steps_ms=(float(steps.min()), float(steps.max())),
+            signals=signals,
+            headings=stds,
+            tips={name: tip._replace(peak_speed=self._peak_speed[name]) for name, tip in tips.items()},
+            error_budget=budget,
         )
 
     def _compose(
         self,
-        measures: Measures,
-        residual_rms: dict[str, float],
+        recording: Recording,
+        static: Mapping[str, np.ndarray],
+        residual_rms: Mapping[str, float],
+        budget: Mapping[str, Mapping[str, float]],
         diagnostics: Iterable[Diagnostic],
     ) -> dict[str, Any]:
-        last, recording = self.last, self._recording.cut(slice(len(self._recording) - self._samples, None))
+        """Compose the content of ``summary.json``; `recording` is what was tracked of it."""
+        last = self.last
         table, correction, segments = last.model.table, last.correction, last.segments
         sensors: dict[str, Any] = {}
         for segment, sensor in recording.sensors.items():
@@ -178,8 +175,7 @@ class SummaryAccumulator:
             if orientation is None:
                 about["orientations"] = "from the recording"
             else:
-                static = sum(int(np.count_nonzero(part)) for part in self._static[segment])
-                about["static_share"] = round(static / self._samples, 4)
+                about["static_share"] = round(int(np.count_nonzero(static[segment])) / self._samples, 4)
                 about["gyro_bias_start_deg_s"] = np.degrees(orientation.noise.gyro_bias).round(5).tolist()
                 about["gyro_bias_end_deg_s"] = np.degrees(orientation.gyro_bias[-1]).round(5).tolist()
                 about["gravity_m_s2"] = round(orientation.noise.gravity, 4)
@@ -214,8 +210,7 @@ class SummaryAccumulator:
         return content | {
             "heading_correction": None if correction is None else correction.summarize(),
             "error_budget_mm": {
-                point: {part: round(1e3 * std, 1) for part, std in parts.items()}
-                for point, parts in measures.error_budget.items()
+                point: {part: round(1e3 * std, 1) for part, std in parts.items()} for point, parts in budget.items()
             },
             "diagnostics": [as_json(diagnostic) for diagnostic in diagnostics],
         }
@@ -238,13 +233,15 @@ def _diagnose_model(tracked: TrackResult, residual_rms: dict[str, float]) -> Ite
             yield Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
 
 
-def _diagnose_motion(tracked: TrackResult, measures: Measures) -> Iterator[Diagnostic]:
+def _diagnose_motion(
+    tracked: TrackResult, signals: Mapping[str, Signal], drifts: Mapping[str, np.ndarray]
+) -> Iterator[Diagnostic]:
     """The diagnostics of signals, headings, start pose and hinges."""
-    for name, signal in measures.signals.items():
+    for name, signal in signals.items():
         yield from _diagnose_signal(tracked, name, signal)
     since, start = find_samples_after_start(tracked), tracked.segments.start
-    stds = compute_joint_heading_stds(measures.headings, tracked.model, "drift")
-    wide = {joint: most for joint, std in stds.items() if (most := finite_max(std[since])) > HEADING}
+    joints = compute_joint_heading_stds(drifts, tracked.model)
+    wide = {joint: most for joint, std in joints.items() if (most := finite_max(std[since])) > HEADING}
     for joint in sorted(wide, key=wide.__getitem__, reverse=True):
         yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING)
     corrections = {} if tracked.correction is None else tracked.correction.max_correction_deg
@@ -255,15 +252,20 @@ def _diagnose_motion(tracked: TrackResult, measures: Measures) -> Iterator[Diagn
             yield Diagnostic("heading-corrected-far", WARNING, name, turned, limit)
     if (late := float(start[0] - tracked.time[0])) > LATE_START_S:
         yield Diagnostic("start-pose-late", INFO, "", late, LATE_START_S)
-    for name, motion in measures.hinges.items():
-        extended, in_plane = motion.extended - RANGE_MARGIN, np.abs(motion.aside) < np.deg2rad(45.0)
-        back = in_plane & (motion.flexion < extended) & (motion.bend < np.deg2rad(90.0))
+    subject = replace(tracked.subject, hinges=tracked.subject.turn_hinges(tracked.model))
+    for name, hinge in tracked.model.table.hinges.items():
+        motion = measure_hinge(tracked.pose, tracked.model.table, name, subject)
+        if motion is None:
+            continue
+        bend, flexion, aside = motion[0], motion[1], np.abs(motion[2])
+        extended = min(float(np.sign(sum(hinge.range) or 1.0)) * end for end in hinge.range) - RANGE_MARGIN
+        back = (aside < np.deg2rad(45.0)) & (flexion < extended) & (bend < np.deg2rad(90.0))
         if (seconds := np.count_nonzero(back) / tracked.recording.rate_hz) > LASTING_S:
-            most, facts = float(-motion.flexion[back].min()), {"duration": seconds}
+            most, facts = float(-flexion[back].min()), {"duration": seconds}
             yield Diagnostic("hinge-implausible", WARNING, name, most, -extended, facts)
-        aside = (motion.bend > BENT) & (np.abs(motion.aside) > ASIDE)
-        if np.count_nonzero(aside) / tracked.recording.rate_hz > LASTING_S:
-            most = float(np.abs(motion.aside[aside]).max())
+        sideways = (bend > BENT) & (aside > ASIDE)
+        if np.count_nonzero(sideways) / tracked.recording.rate_hz > LASTING_S:
+            most = float(aside[sideways].max())
             yield Diagnostic("hinge-implausible", WARNING, name, most, ASIDE, {"variant": "sideways"})
 
 
