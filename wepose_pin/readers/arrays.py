@@ -51,7 +51,15 @@ class ArrayFile:
         self._loaded: dict[str, np.ndarray] = {}
         if HDF5_MAGIC in (start[:8], start[512:]):  # MATLAB puts 512 bytes of its own before it
             self._hdf5 = import_library("h5py", self.path, "HDF5 (MATLAB's v7.3 is too)")
-            self.shapes = self._read_hdf5_shapes()
+            self.shapes = {}
+
+            def visit(name: str, node: Any) -> None:
+                dtype = getattr(node, "dtype", None)  # a group has none
+                if dtype is not None and dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
+                    self.shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
+
+            with library_errors(self.path, KIND), self._hdf5.File(self.path) as file:
+                file.visititems(visit)
         else:
             self._loaded = {name: values for name, values in read_mat(self.path).items() if values.ndim}
             self.shapes = {name: values.shape for name, values in self._loaded.items()}
@@ -59,13 +67,7 @@ class ArrayFile:
             raise BadData(f"{self.path}: no arrays of numbers in it")
 
     def table(self, wanted: Mapping[str, str]) -> pl.DataFrame:
-        """Read columns by name, ``path`` of an array (n,) or ``path[k]``; `wanted` maps each to an error's beginning.
-
-        Raises
-        ------
-        UnknownColumn, BadData
-            An array or its column does not exist; arrays have different lengths.
-        """
+        """Read columns by name, ``path`` of an array or ``path[k]``; `wanted` is name → what begins an error."""
         columns = {}
         for name, place in wanted.items():
             part = re.fullmatch(r"(.*)\[(\d+)\]", name)
@@ -104,29 +106,12 @@ class ArrayFile:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]
 
-    def _read_hdf5_shapes(self) -> dict[str, tuple[int, ...]]:
-        shapes: dict[str, tuple[int, ...]] = {}
-
-        def visit(name: str, node: Any) -> None:
-            dtype = getattr(node, "dtype", None)  # a group has none
-            if dtype is not None and dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
-                shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
-
-        with library_errors(self.path, KIND), self._hdf5.File(self.path) as file:
-            file.visititems(visit)
-        return shapes
-
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of numbers in a MATLAB file but for v7.3, without sides of length one; structs' fields are parts.
 
     Path → array (n,) or (n, k), or a single number, (). What is neither a number nor a struct of one element is passed
     over.
-
-    Raises
-    ------
-    BadData
-        No such file, or a damaged one.
     """
     arrays: dict[str, np.ndarray] = {}
 

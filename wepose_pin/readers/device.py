@@ -92,28 +92,27 @@ def make_device(
     BadData
         No sensor has what `use` asks for; numbers that no device measures; signals without a time in common.
     """
-    kinds = [use] if use else list(NEEDED)
-    of_kind = {
-        kind: {label: each for label, each in sensors.items() if set(NEEDED[kind]) <= set(each)} for kind in kinds
-    }
-    kind = next((kind for kind in kinds if of_kind[kind]), None)
-    if kind is None:
+    for kind in [use] if use else NEEDED:
+        complete = {label: each for label, each in sensors.items() if set(NEEDED[kind]) <= set(each)}
+        if complete:
+            break
+    else:
         raise BadData(f"{path}: no sensor in it has {needs}{'; leave out data.use' if use else ''}")
-    device = Device(kind, read := dict[str, DeviceSensor]())
-    for label, signals in of_kind[kind].items():
+    read: dict[str, DeviceSensor] = {}
+    for label, signals in complete.items():
         for signal in NEEDED[kind]:
             check_measured(f"{path}: {signal} of {label}", signals[signal].values)
         time, values = join_signals(f"{path.name} {label}", {name: signals[name] for name in NEEDED[kind]})
         if len(time) < FEWEST:
             raise BadData(f"{path}: holds {len(time)} samples of {label}; the export is empty or cut off")
-        texts = [label, (hints or {}).get(label, ""), path.absolute().stem if len(of_kind[kind]) == 1 else ""]
+        texts = [label, (hints or {}).get(label, ""), path.absolute().stem if len(complete) == 1 else ""]
         segment = next(filter(None, map(load_table().guess_segment, filter(None, texts))), None)
         read[label] = DeviceSensor(np.arange(len(time)) / rate_hz if rate_hz else time, values, segment)
     if left_out := [label for label in sensors if label not in read]:
         facts = {"devices": ", ".join(left_out), "signals": " and ".join(NEEDED[kind])}
         missing = Diagnostic("sensors-left-out", WARNING, path.name, len(left_out), facts=facts)
         diagnostics = [*diagnostics, missing]
-    return device._replace(diagnostics=tuple(diagnostics))
+    return Device(kind, read, diagnostics=tuple(diagnostics))
 
 
 def convert(path: Path, signal: str, values: np.ndarray, unit: str, column: str) -> np.ndarray:
@@ -147,17 +146,14 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
         return first.time, {name: signal.values for name, signal in signals.items()}
     ((other, second),) = rest
     (time, rates), (own, forces) = _drop_missing(first), _drop_missing(second)
-    if len(time) < 2 or len(own) < 2 or min(time[-1], own[-1]) <= max(time[0], own[0]):
+    inside = (time >= own[:1].max(initial=-np.inf)) & (time <= own[-1:].min(initial=np.inf))
+    if len(own) < 2 or inside.sum() < 2:
         raise BadData(f"{place}: {name} and {other} have no time in common, of {len(time)} and {len(own)} rows")
-    if np.array_equal(time, own):
-        return time, {name: rates, other: forces}
-    inside = (time >= own[0]) & (time <= own[-1])
     time, rates = time[inside], rates[inside]
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
-    steps = own[after] - own[after - 1]
     joined = np.column_stack([np.interp(time, own, axis) for axis in forces.T])
-    off = np.minimum(time - own[after - 1], own[after] - time)
-    joined[(steps > LONGEST_STEPS * np.median(np.diff(own))) & (off > 0.0)] = np.nan
+    far = own[after] - own[after - 1] > LONGEST_STEPS * np.median(np.diff(own))
+    joined[far & (time != own[after]) & (time != own[after - 1])] = np.nan
     return time, {name: rates, other: joined}
 
 

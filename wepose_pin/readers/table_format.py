@@ -77,7 +77,6 @@ class ClockColumn(NamedTuple):
     unit_s: Annotated[float, Key(name="unit_s")] = 1.0  # [s]
     wraps: Annotated[float | None, Key(most=1e12)] = None  # value at which it begins again at 0
     rate: str = ""  # pattern of the line before the table with the rate of which the column counts the samples
-    date: str = ""  # how it is written where it is no number
     spread: bool = False  # equal times are those of a packet
 
 
@@ -87,7 +86,6 @@ class TableFormat(NamedTuple):
     title: str = ""
     needs: str = ""
     detect: tuple[str, ...] = ()
-    suffixes: tuple[str, ...] = ()
     whole: bool = False
     times_before: bool = False
     sensors_line: _Line = 0.0
@@ -95,7 +93,6 @@ class TableFormat(NamedTuple):
     axes_line: _Line = 0.0
     units_line: _Line = 0.0
     label_line: str = ""
-    label_in_name: str = ""
     sync_line: str = ""
     files: Annotated[Mapping[str, str], None] = MappingProxyType({})
     clocks: Annotated[tuple[ClockColumn, ...], None] = ()
@@ -109,8 +106,6 @@ class TableFormat(NamedTuple):
     def detects(self, path: Path, start: str) -> bool:
         """Return whether a file that starts with this text, a folder, or a zip is of the format."""
         if path.is_file() and path.suffix.lower() != ".zip":
-            if self.suffixes and path.suffix.lower() not in self.suffixes:
-                return False
             matches = [bool(re.search(pattern, start, re.S | re.M)) for pattern in self.detect]
             # A table with all signals is one that needs no folder.
             return any(matches) and (len(matches) == 1 or (not all(matches) and self.detects(path.parent, "")))
@@ -175,7 +170,7 @@ def load_format(path: Path) -> TableFormat:
         raise BadSession(f"{path}: needs [[clock]], and [[gyro]] and [[accel]], or [[orientation]]")
     keys = table.table("files", {})
     keys.allow(*NEEDED)
-    patterns = [*format.detect, format.sensor_begins, format.label_in_name]
+    patterns = [*format.detect, format.sensor_begins]
     patterns += [text for clock in clocks for text in (clock.column, clock.rate)]
     for signal, each in entries.items():
         for entry, columns in each:
@@ -362,8 +357,7 @@ def _name_alone(format: TableFormat, path: Path) -> str:
     path = path.absolute()
     if path.is_dir() or any(fnmatch.fnmatch(path.name, pattern) for pattern in format.files.values()):
         return path.name if path.is_dir() else path.parent.name
-    match = _match(format.label_in_name, path.stem) if format.label_in_name else None
-    return (match.groupdict().get("label") if match else None) or path.stem
+    return path.stem
 
 
 def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
@@ -419,7 +413,7 @@ def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float
                 return table.times.setdefault(column, packets / (max(1.0, float(np.median(np.diff(packets)))) * rate))
         elif not rate_hz:
             if column not in table.times:
-                time = _read_stamps(clock, table, column)
+                time = clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
                 table.times[column] = spread_equal_times(time) if clock.spread else time
             return table.times[column]
     if rate_hz:
@@ -441,16 +435,6 @@ def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor:
     matches = {k: match for k, name in enumerate(table.names) if (match := _match(clock.column, name))}
     own = (k for k, match in matches.items() if match.groupdict().get("sensor") == sensor)
     return next(own, next(iter(matches), None))  # else the times may be shared
-
-
-def _read_stamps(clock: ClockColumn, table: DeviceTable, column: int) -> np.ndarray:
-    """Read a column of times [s], of numbers or dates."""
-    cells = table.cells[str(column)]
-    if clock.date and cells.dtype == pl.String:
-        dates = cells.str.to_datetime(clock.date, time_unit="us", strict=False)
-        if dates.null_count() < len(dates):
-            return 1e-6 * dates.to_physical().cast(pl.Float64).fill_null(np.nan).to_numpy()
-    return clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
 
 
 def _unwrap(counter: np.ndarray, wraps: float | None) -> np.ndarray:
