@@ -37,7 +37,6 @@ LONGEST_RECORD = 1 << 28  # [bytes] longer than any that we write
 MOST_RATE = 10_000.0
 LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text
 KIND = "a recording of wepose live"
-_BROKE_OFF = "{}: broke off before the start pose was held; there is nothing to track in it"
 _VECTOR = {"type": "array", "items": {"type": "number"}}
 SCHEMAS: dict[str, dict[str, Any]] = {
     name: {"type": "object", "properties": properties}
@@ -113,33 +112,32 @@ def read_live_log(path: Path) -> LiveRecording:
     check_file(path, f"{KIND}, as --record writes one,")
     if not is_live_log(path):
         raise BadData(f"{path}: is not the recording of a live session")
+    broke_off = BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     with library_errors(path, KIND):
         header, arrivals, events, poses, is_complete = _read_content(path)
+        by_kind = {event["kind"]: event for event in events}  # the last of each
+        if not header or "clock" not in by_kind:
+            raise broke_off
+        clock, start = by_kind["clock"], None
+        if not 0.1 <= clock["rate_hz"] <= MOST_RATE:
+            raise BadData(f"{path}: ticks at {clock['rate_hz']:g} Hz; the file is damaged")
+        timing = clock["rate_hz"], clock["begin"], clock["wait_s"]
+        synchronizer = StreamSynchronizer(header["sensors"], *timing, header["orientations"])
+        ticks = [*synchronizer.push(arrivals)]
+        if "start" in by_kind:
+            start = int(by_kind["start"]["begin"]), int(by_kind["start"]["end"])
+        if synchronizer.next_tick < (start[1] + 2 if start else 2):
+            raise broke_off
         markers = Markers()
-        synchronizer: StreamSynchronizer | None = None
-        start: tuple[int, int] | None = None
-        resets = []
         for event in events:
-            if event["kind"] == "clock":
-                if not 0.1 <= event["rate_hz"] <= MOST_RATE:
-                    raise BadData(f"{path}: ticks at {event['rate_hz']:g} Hz; the file is damaged")
-                clock = event["rate_hz"], event["begin"], event["wait_s"]
-                synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
-            elif event["kind"] == "start":
-                start = int(event["begin"]), int(event["end"])
-            elif event["kind"] == "reset":
-                resets.append(int(event["tick"]))
-            else:
-                markers.add(event["kind"], event)
-        ticks = [] if synchronizer is None else [*synchronizer.push(arrivals)]
-        if synchronizer is None or synchronizer.next_tick < 2 or (start and synchronizer.next_tick <= start[1] + 1):
-            raise BadData(_BROKE_OFF.format(path))
-        resets = [tick for tick in resets if tick < synchronizer.next_tick]
+            markers.add(event["kind"], event)
         header["sensors"] = [markers.segments.get(name, name) for name in header["sensors"]]
         ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
         header["phases"] = {**header["phases"], **markers.phases(*ends)}
         if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
-            raise BadData(_BROKE_OFF.format(path))
+            raise broke_off
+        resets = [int(event["tick"]) for event in events if event["kind"] == "reset"]
+        resets = [tick for tick in resets if tick < synchronizer.next_tick]
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets))
     recording = replace(check_recording(recording), marks=tuple(markers.texts))
     if not is_complete:
@@ -155,10 +153,10 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     recording = read_live_log(path).recording
     sensors = {}
     for name, sensor in recording.sensors.items():
-        if isinstance(sensor, OrientationSensor):
-            signals = {"orientation": sensor.quat_VS}
-        else:
+        if isinstance(sensor, ImuSensor):
             signals = {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
+        else:
+            signals = {"orientation": sensor.quat_VS}
         if sensor.gap is not None:
             signals = {key: np.where(sensor.gap[:, None], np.nan, values) for key, values in signals.items()}
         sensors[name] = DeviceSensor(recording.time, signals, name, sensor.stated_quat_LS)
@@ -221,11 +219,9 @@ def _read_content(path: Path) -> tuple[dict[str, Any], Arrivals, list[dict[str, 
             samples.extend((header["sensors"].index(topic.removeprefix(SENSORS)), message["t"]))
             packed = [*message["orientation"], 0.0, 0.0] if "orientation" in message else None
             samples.extend(packed or [*message["gyro"], *message["accel"]])
-    if not header:
-        raise BadData(_BROKE_OFF.format(path))
     which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
     arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
-    rows = np.array(poses).reshape(-1, 1 + 4 * len(header["sensors"]))
+    rows = np.array(poses).reshape(-1, 1 + 4 * len(header.get("sensors", ())))
     return header, arrivals, events, rows, is_complete
 
 
@@ -240,9 +236,8 @@ def build_recording(
 ) -> Recording:
     """Build a recording from consecutive ticks, up to the tick `last`; lost samples are bridged and marked.
 
-    `header` has name, sensors, mounts, phases, start_pose, remounted, joints and model. `start`: first and last tick of
-    the start pose; None: that of the header's phases. `resets`: ticks before which the headings were reset. `BadData`
-    is raised where a sensor never sent a sample.
+    `header`: as of `LiveRecording`. `start`: first and last tick of the start pose; None: that of the header's phases.
+    `resets`: ticks before which the headings were reset. `BadData`: a sensor never sent a sample.
     """
     first = ticks[0].first
     count = sum(len(t.time) for t in ticks) if last is None else last + 1 - first
@@ -270,16 +265,6 @@ def build_recording(
         phases[name] = tuple((a, min(b, float(time[-1]))) for a, b in inside if not whole or b <= time[-1])
     if start is not None:
         phases["start"] = ((float(time[start[0] - first]), float(time[start[1] - first])),)
-    return Recording(
-        header["name"],
-        time,
-        rate_hz,
-        sensors,
-        phases,
-        header["start_pose"],
-        header["remounted"],
-        source=source,
-        resets=tuple(tick - first for tick in resets),
-        joints=header["joints"],
-        model=header["model"],
-    )
+    named = {key: header[key] for key in ("name", "start_pose", "remounted", "joints", "model")}
+    after = tuple(tick - first for tick in resets)
+    return Recording(time=time, rate_hz=rate_hz, sensors=sensors, phases=phases, source=source, resets=after, **named)
