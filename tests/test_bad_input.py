@@ -140,7 +140,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "columns of another sensor": (
         lambda f: setattr(f, "session", f.session + f.session[f.session.index("[sensors") :].replace("torso", "head")),
-        "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso too; each sensor needs its own",
+        "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso too",
     ),
     "a format beside columns": (
         lambda f: f.say("accel =", "format = 'dot'\naccel ="),
@@ -264,7 +264,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     # values
     "a quaternion that is no unit": (
         lambda f: (setattr(f, "session", QUATS), f.put("qw", slice(4, 5), 0.5)),
-        "arm.csv: sensors.torso.orientation has length 0.5 in row 5; a unit quaternion is needed",
+        "arm.csv: sensors.torso.orientation has length 0.5 in row 5; a unit quaternion x, y, z, w is needed",
     ),
     "accel in g": (
         lambda f: f.scale("ax ay az", 1 / 9.81),

@@ -252,7 +252,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
         (["-o", "x.mcap", "--instruction", "go"], "--instruction go: not of format mcap; only of format lerobot"),
         (
             ["-o", "x.trc"],
-            "--format trc: is of a person's motion, and ",
+            "is a robot's trajectory, for lerobot",
         ),
         (["-o", "x.bin", "--format", "mcap"], "name it x.mcap"),
         (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
@@ -282,5 +282,5 @@ def test_a_wrong_export_of_a_robot_takes_one_line(
 def test_a_person_is_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "r", a_pose(n=5))
     arguments = [str(folder), "-o", str(tmp_path / "d"), "--format", "lerobot"]
-    assert_refused(capsys, arguments, "is of a robot's trajectory, as `wepose retarget` writes it")
+    assert_refused(capsys, arguments, "is of robots, as `wepose retarget` writes them")
     assert [path.name for path in tmp_path.iterdir()] == ["r"]

@@ -233,7 +233,7 @@ def test_lost_frames_are_gaps(tmp_path: Path) -> None:
 def test_a_mount_beside_aligned_orientations_is_an_error(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning())
     mount = 'mount = { up = "+x", forward = "-z" }'
-    with pytest.raises(BadSession, match=r"sensors\.torso: aligned orientations .* need no mount"):
+    with pytest.raises(BadSession, match=r"sensors\.torso: aligned orientations .* no mount"):
         wp.load_session(session(tmp_path, path.name, ("torso",), each=mount))
     assert (
         not wp.load_session(session(tmp_path, path.name, ("torso",), each=f"aligned = false\n{mount}"))

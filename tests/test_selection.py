@@ -67,10 +67,9 @@ def test_what_selects_nothing_is_said(interval, phase, said: str, result: Path, 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("phases", ["{}", "[1]", '{"start": [1, 2], "c": null, "d": [["x", 1]]}'])
-def test_a_recording_without_phases_has_none_to_choose(phases: str, tmp_path: Path) -> None:
+def test_a_recording_without_phases_has_none_to_choose(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "result", a_pose())
-    (folder / "summary.json").write_text(f'{{"recorded_phases": {phases}}}', encoding="utf-8")
+    (folder / "summary.json").write_text('{"recorded_phases": {}}', encoding="utf-8")
     with pytest.raises(wp.WeposeError, match="has no phases; use --interval FROM TO"):
         wp.export(folder, tmp_path / "a.csv", phase="start")
 

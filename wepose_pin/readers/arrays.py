@@ -33,13 +33,7 @@ def is_array_file(path: Path) -> bool:
 
 @dataclass
 class ArrayFile:
-    """The arrays of numbers in a file; those of an HDF5 file are read on demand.
-
-    Raises
-    ------
-    MissingFile, BadData
-        The file is missing, neither HDF5 nor MATLAB's, or damaged; or h5py is not installed.
-    """
+    """The arrays of numbers in a file; those of an HDF5 file are read on demand."""
 
     path: Path
     shapes: dict[str, tuple[int, ...]] = field(init=False)

@@ -68,21 +68,17 @@ def _make_guess(
     names: Sequence[str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
 ) -> Guess:
     sensors: dict[str, Mapping[str, list[str]]] = {}
+    units: dict[str, str | None] = {}
     for name, signals in by_sensor.items():
         needed = ("gyro", "accel") if {"gyro", "accel"} <= set(signals) else ("orientation",)
         if set(needed) <= set(signals):
             sensors[name] = {signal: signals[signal] for signal in signals if signal in needed}
+            units |= {signal: guess_unit(signal, own_units.get(signals[signal][0], "")) for signal in needed}
     times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
-    units = {}
     for name in times:
         words = [own_units.get(name, "").lower(), *_split_words(name)]
-        if unit := next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None):
-            units[name] = unit
-    for signals in sensors.values():
-        for signal, columns in signals.items():
-            if unit := guess_unit(signal, own_units.get(columns[0], "")):
-                units[signal] = unit
-    return Guess(times, sensors, units)
+        units[name] = next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None)
+    return Guess(times, sensors, {name: unit for name, unit in units.items() if unit})
 
 
 def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[str, dict[str, list[str]]]:
@@ -96,8 +92,7 @@ def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[
         owned = {name for axes in groups.values() if len(axes) > 2 for name in axes.values()}
         for name in names:
             for stem, axis in find_axes(split_unit(name)[0]) if name not in owned else ():
-                signal = guess_signal(stem.replace("linear_acc", "acc") if ros else stem)
-                if signal:
+                if signal := guess_signal(stem.replace("linear_acc", "acc") if ros else stem):
                     groups.setdefault((stem, signal), {})[axis] = name
     for (stem, signal), axes in groups.items():
         order = ORDER[signal]

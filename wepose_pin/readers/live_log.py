@@ -104,10 +104,7 @@ def is_live_log(path: Path) -> bool:
 def read_live_log(path: Path) -> LiveRecording:
     """Read a live session's recording; its ticks are computed from the arrivals, bit-identical to the live ones.
 
-    Raises
-    ------
-    MissingFile, BadData
-        The file is missing, is no such recording, or ends before the start pose.
+    `MissingFile` or `BadData` is raised where the file is missing, is no such recording, or ends before the start pose.
     """
     check_file(path, f"{KIND}, as --record writes one,")
     if not is_live_log(path):

@@ -62,10 +62,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
     frames = read_frames(path, rate_hz)
     raw = {"sensorAngularVelocity", "sensorAcceleration"} <= set(frames.values)
     if use == "raw" and not raw:
-        raise BadData(
-            f"{path}: no sensorAngularVelocity and sensorAcceleration; MVN writes them no more since 2018. Leave out "
-            f"data.use, and its segments' orientations are read"
-        )
+        raise BadData(f"{path}: no sensorAngularVelocity and sensorAcceleration; leave out data.use for orientations")
     diagnostics = _diagnose_frames(path, frames)
     signals: dict[str, dict[str, np.ndarray]]
     if raw and use != "orientation":
@@ -103,12 +100,7 @@ def read_subject(path: Path) -> Subject:
     """Read ``subject.toml``, the folder that holds it, or the lengths in an MVNX.
 
     The lengths between MVN's joints are taken as they are, with the standard deviation `LENGTH_STD`; the others are the
-    population's.
-
-    Raises
-    ------
-    MissingFile, BadSubject, BadData
-        Not there; a subject that is none; no lengths in the MVNX.
+    population's. `WeposeError` is raised where it is not there, is no subject, or has no lengths.
     """
     if path.suffix.lower() != ".mvnx":
         return load_subject(path)
@@ -117,9 +109,7 @@ def read_subject(path: Path) -> Subject:
         joints[ROOT] = np.mean([joints[hip] for hip in HIPS], axis=0)
     for name, length in load_table().lengths.items():
         if {*length.start, *length.end} <= set(joints):
-            first, last = (
-                np.mean([joints[point] for point in points], axis=0) for points in (length.start, length.end)
-            )
+            first, last = (np.mean([joints[point] for point in end], axis=0) for end in (length.start, length.end))
             lengths[name] = float(np.nanmedian(np.linalg.norm(last - first, axis=1)))
     if not lengths:
         raise BadData(f"{path}: no positions of the arms' segments in it; export it with <position>")
@@ -160,13 +150,7 @@ def _read_quats(frames: Frames) -> dict[str, np.ndarray]:
 
 
 def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
-    """Read all frames of type `normal`; `rate_hz` replaces the file's frameRate.
-
-    Raises
-    ------
-    BadData
-        Not there; no MVNX, damaged or cut off; frames of unlike size.
-    """
+    """Read all frames of type `normal`; `rate_hz` replaces the file's frameRate."""
     from lxml import etree
 
     labels: dict[str, list[str]] = {"segment": [], "sensor": []}
@@ -221,9 +205,7 @@ def _read_values(path: Path, tag: str, rows: Sequence[str], count: int) -> np.nd
         try:
             values[k] = np.array(text.split(), dtype=float).reshape(values.shape[1])
         except ValueError:
-            raise BadData(
-                f"{path}: <{tag}> of frame {k} begins with '{text[:40]}'; {WIDTH[tag]} numbers for each of {count} are "
-                f"needed"
-            ) from None
+            needed = f"{WIDTH[tag]} numbers for each of {count} are needed"
+            raise BadData(f"{path}: <{tag}> of frame {k} begins with '{text[:40]}'; {needed}") from None
     check_measured(f"{path}: <{tag}>", values)
     return values.reshape(len(rows), count, WIDTH[tag])

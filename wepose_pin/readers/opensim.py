@@ -29,10 +29,8 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
         raise BadData(f"{path}: no line 'endheader' in its first {len(lines)} lines; an OpenSim .sto file has one")
     about = {key.strip().lower(): value.strip() for key, _, value in (line.partition("=") for line in lines[:end])}
     if about.get("datatype", "").lower() != "quaternion":
-        raise BadData(
-            f"{path}: DataType={about.get('datatype') or 'none'}; orientations are needed, DataType=Quaternion "
-            f"(OpenSense's …_orientations.sto)"
-        )
+        kind = about.get("datatype") or "none"
+        raise BadData(f"{path}: DataType={kind}; orientations are needed, DataType=Quaternion, as of OpenSense")
     if about.get(OWN[0].lower()) == OWN[1]:
         raise BadData(f"{path}: was written by `wepose export`; use the result that it was made from")
     signals = {}

@@ -52,13 +52,7 @@ def is_reference(path: Path) -> bool:
 
 
 def read_reference(path: Path, markers: Path | None = None) -> Reference:
-    """Read what another system measured; `markers`: a table of markers that goes before the shipped one.
-
-    Raises
-    ------
-    MissingFile, BadSession, BadData
-        A file is not there, is damaged, or lacks what is needed.
-    """
+    """Read what another system measured; `markers`: a table of markers that goes before the shipped one."""
     check_file(path, "a C3D, TRC or MVNX")
     suffix = path.suffix.lower()
     if suffix == ".mvnx":
@@ -242,10 +236,8 @@ def _locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tab
                 break
     if not points and not quats:
         expected = sorted({each for ways in table.points.values() for way in ways for each in way} - set(table.points))
-        raise BadData(
-            f"{path}: no joint follows from its markers ({', '.join(list(markers)[:8]) or 'none'}, …); "
-            f"{one_of(expected, most=12)}. Name yours in a table of markers (--markers)"
-        )
+        listed = ", ".join(list(markers)[:8]) or "none"
+        raise BadData(f"{path}: no joint follows from its markers ({listed}, …); {one_of(expected)}, or by --markers")
     return Reference(time, quats, points)
 
 

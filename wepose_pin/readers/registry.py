@@ -72,13 +72,10 @@ def look_up_format(name: str) -> Format | TableFormat:
 
 def find_format(name: str, folder: Path, place: str) -> str:
     """Find a format by its name, or the path of a description from the folder of the session; `place` states it."""
-    if name.endswith(".toml"):
-        load_format(folder / name)
-        return str(folder / name)
     known = [*find_plugins("readers"), *load_formats()]
-    if name not in known:
+    if not name.endswith(".toml") and name not in known:
         raise BadSession(f"{place} = '{name}' is not known; {one_of(known, name)}; or a description, such as lab.toml")
-    return name
+    return str(folder / name) if name.endswith(".toml") else name
 
 
 def detect_format(path: Path) -> str | None:
@@ -101,15 +98,7 @@ def detect_format(path: Path) -> str | None:
 
 
 def read_device(path: Path, name: str, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read a file of a format, by its name or the path of a description.
-
-    `use` selects "raw" or "orientation" of a file with both; `rate_hz` replaces its own clock.
-
-    Raises
-    ------
-    MissingFile, BadData
-        The file is missing, damaged, or of another format.
-    """
+    """Read a file of a format, by its name or the path of a description; `use` and `rate_hz` as of `Format.read`."""
     format = look_up_format(name)
     if not (format.folder and path.is_dir()):
         check_file(path, f"a {format.title}")

@@ -85,9 +85,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         else:
             measured[name] = files.read_sensor(table, each)
         if measured[name].aligned and ("mount" in table or "orientation" not in measured[name].values):
-            raise BadSession(
-                f"{table.where}: aligned orientations are the segment's own: they need no mount, and no raw data"
-            )
+            raise BadSession(f"{table.where}: aligned orientations are the segment's own: no mount, and no raw data")
     files.tables.clear()  # of a day they are gigabytes
     time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
     check_phases(str(path), time, head.phases)
@@ -190,10 +188,7 @@ class _Files:
         path = self._find_file(keys)
         if bool(keys.time) == (keys.rate_hz is not None):
             stated = "both is" if keys.time else "neither is"
-            raise BadSession(
-                f"{self._at(table, 'time')} or rate_hz is needed, one of the two, and {stated} there: a column of "
-                f"times, or a rate"
-            )
+            raise BadSession(f"{self._at(table, 'time')} or rate_hz is needed, one of the two, and {stated} there")
         units = {"orientation": 1.0}
         for signal, unit, known in (("gyro", keys.gyro_unit, GYRO_UNITS), ("accel", keys.accel_unit, ACCEL_UNITS)):
             if signal in keys.signals and not unit:
@@ -247,13 +242,7 @@ def _open(opened: dict[Path, T], read: Callable[[Path], T], path: Path) -> T:
 
 
 def _bridge_gaps(measured: _Measured, faults: Sequence[Fault], gaps: bool) -> tuple[Sensor, np.ndarray]:
-    """Put the rows on the clock and bridge gaps; with the marks (n,) of lost samples.
-
-    Raises
-    ------
-    BadData
-        A signal has no numbers, or a gap is too long and `gaps` are not accepted.
-    """
+    """Put the rows on the clock and bridge gaps, long ones where `gaps` are accepted; and the marks (n,) of samples."""
     clock = measured.clock
     frozen = np.zeros(len(clock.time), dtype=bool)
     for fault in faults:
@@ -268,10 +257,10 @@ def _bridge_gaps(measured: _Measured, faults: Sequence[Fault], gaps: bool) -> tu
             raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {listed}")
         if not gaps and (long := find_runs(mark_lost_samples(clock, good) == LONG)):
             first, last = long[0]
+            lost_s, row = (last - first) * clock.step, clock.row[:first].max(initial=-1) + 1
             raise BadData(
-                f"{place}: samples are missing for {(last - first) * clock.step:.3f} s from {clock.time[first]:.3f} s, "
-                f"after row {clock.row[:first].max(initial=-1) + 1}; up to 50 ms are bridged; cut the recording there, "
-                f"or accept gaps by --gaps (gaps=True)"
+                f"{place}: samples are missing for {lost_s:.3f} s from {clock.time[first]:.3f} s, after row {row}; up "
+                f"to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
             )
         lost |= ~good
     marks = mark_lost_samples(clock, ~lost)
@@ -300,18 +289,13 @@ def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -
     good &= norm > 0.0  # many exports write zeros for a lost sample
     not_unit = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_ERROR))
     if not_unit.size:
-        raise BadData(
-            f"{place} has length {norm[not_unit[0]]:.3g} in row {clock.row[not_unit[0]] + 1}; a unit quaternion is "
-            f"needed, columns in the order x, y, z, w"
-        )
+        length, row = norm[not_unit[0]], clock.row[not_unit[0]] + 1
+        raise BadData(f"{place} has length {length:.3g} in row {row}; a unit quaternion x, y, z, w is needed")
     return values / np.where(good, norm, np.nan)[:, None], good
 
 
 def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
-    """Report the bridged gaps of a sensor, from the marks (n,) of its samples and their usual step [s].
-
-    Short gaps are reported where they are many.
-    """
+    """Report bridged gaps, short ones where they are many, from the marks (n,) of the samples and their step [s]."""
     long, short = ([last - first for first, last in find_runs(marks == mark)] for mark in (LONG, BRIDGED))
     if long:
         facts: dict[str, float | str] = {"samples": sum(long), "gaps": len(long)}

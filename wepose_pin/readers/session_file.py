@@ -61,32 +61,18 @@ class SensorKeys(NamedTuple):
 
 
 def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> TomlTable:
-    """Read a session file, or the one in a folder; `values` are its contents where it does not exist yet.
-
-    Raises
-    ------
-    MissingFile, BadSession
-        The file is missing, is not TOML or a data file, or has an unknown key.
-    """
+    """Read a session file, or the one in a folder; `values` are its contents where it does not exist yet."""
     path = path / "session.toml" if path.is_dir() else path
     if path.suffix.lower() in DATA:
-        raise BadSession(
-            f"{path}: is a table of data by its name; a session file is wanted here, which names the table (`wepose "
-            f"info {path.name} --write` writes one)"
-        )
+        written = f"which `wepose info {path.name} --write` writes"
+        raise BadSession(f"{path}: is a table of data by its name; a session file is wanted here, {written}")
     top = TomlTable(read_toml(path, "a session file") if values is None else values, str(path))
     top.allow(*SESSION_KEYS)
     return top
 
 
 def read_head(top: TomlTable) -> Recording:
-    """Read what a session file states besides its data: a recording without sensors and samples.
-
-    Raises
-    ------
-    MissingFile, BadSession, BadPhase
-        A key has a wrong value, or names a file that is missing; a phase is empty.
-    """
+    """Read what a session file states besides its data: a recording without sensors and samples."""
     path, name = Path(top.file), top.text("name", None)
     start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
     joints, truth = top.table("joints", {}), top.table("data", {}).text("truth", None)
@@ -115,10 +101,8 @@ def _find_model(path: Path, top: TomlTable) -> str:
     name = top.text("model", None) or ""
     file = path.parent / name
     if name and not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
-        raise MissingFile(
-            f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name "
-            f"of a body of the package is needed"
-        )
+        needed = "a URDF, its table, or the name of a body of the package is needed"
+        raise MissingFile(f"{top.at('model')}: no such file '{name}' beside {path.name}; {needed}")
     return str(file) if file.is_file() else name
 
 
@@ -169,10 +153,8 @@ def check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys
     for name, each in keys.items():
         for signal, column in ((signal, column) for signal, own in each.signals.items() for column in own):
             if (owner := owners.setdefault((each.file, column), name)) != name:
-                raise BadSession(
-                    f"{tables[name].at(signal)}: '{column}' of {each.file} is a column of sensors.{owner} too; "
-                    f"each sensor needs its own"
-                )
+                place = tables[name].at(signal)
+                raise BadSession(f"{place}: '{column}' of {each.file} is a column of sensors.{owner} too")
 
 
 def format_keys(keys: Mapping[str, Any], checks: Mapping[str, str] = MappingProxyType({})) -> list[str]:

@@ -155,13 +155,7 @@ def _match(pattern: str, text: str) -> re.Match[str] | None:
 
 
 def load_format(path: Path) -> TableFormat:
-    """Load a description.
-
-    Raises
-    ------
-    WeposeError
-        The file is missing or no description: an unknown or wrong key, or a pattern that is none.
-    """
+    """Load a description; `WeposeError`: the file is missing, has a wrong key, or a pattern that is none."""
     table = TomlTable(read_toml(path, "a description of tables"), str(path))
     format = read_record(TableFormat, table, others=("files", "clock", *AXES))
     entries = {signal: [(each, read_record(Columns, each)) for each in table.entries(signal)] for signal in AXES}
@@ -419,10 +413,7 @@ def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float
     if rate_hz:
         return table.times.setdefault(None, np.arange(table.cells.height) / rate_hz)
     names = " or ".join(f"'{clock.column}'" for clock in format.clocks)
-    raise MissingRate(
-        f"{table.path}: no times are known from {names}, or a rate in a line before the table; state the update "
-        f"rate as rate_hz in [data], or export one of them"
-    )
+    raise MissingRate(f"{table.path}: no times are known from {names}; state the update rate as rate_hz in [data]")
 
 
 def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor: str) -> int | None:

@@ -60,9 +60,7 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     check_complete(motion, "a .bvh")
     table = motion.model.table
     if table.is_mechanism or table.reference not in motion.pose.quat_WL:
-        raise BadData(
-            f"{motion.where}: no orientation of a person's {table.reference} in pose.parquet; a .bvh ties all to it"
-        )
+        raise BadData(f"{motion.where}: no orientation of a person's {table.reference}; a .bvh ties all to it")
     motion = resample_evenly(motion)
     root = _build_skeleton(motion)
     columns = [100.0 * _to_file_axes(_compute_root_position(motion, root)), *_compute_angles(motion, root, None)]

@@ -32,10 +32,7 @@ def write_c3d(path: Path, motion: Motion) -> None:
     n = len(motion.pose.time)
     if n > MOST_FRAMES:
         rate_hz = np.floor(motion.rate_hz * MOST_FRAMES / n)
-        raise BadData(
-            f"{motion.where}: {n} samples; a .c3d holds {MOST_FRAMES}, which --rate-hz {rate_hz:g} makes fewer than; "
-            f"a .trc holds all"
-        )
+        raise BadData(f"{motion.where}: {n} samples; a .c3d holds {MOST_FRAMES}: --rate-hz {rate_hz:g}, or a .trc")
     p_W = np.stack([p.T for p in points.values()], axis=1)  # (3, points, n)
     file = ezc3d.c3d()
     parameters = file["parameters"]["POINT"]

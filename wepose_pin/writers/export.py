@@ -263,16 +263,12 @@ def _read_motion(
     if _is_of_robot(result):
         if of == PERSON:
             others = ", ".join(each for each, other in list_formats().items() if other.of != PERSON)
-            raise BadOption(
-                f"--format {format}: is of a person's motion, and {result} is a robot's trajectory, for {others}"
-            )
+            raise BadOption(f"--format {format}: {result} is a robot's trajectory, for {others}")
         robot = result.joint_motion() if isinstance(result, HasJointMotion) else read_joint_motion(Path(str(result)))
         robot = robot.select(interval, phase)
         return robot if rate_hz is None else resample_joints(robot, rate_hz)
     if of == ROBOTS:
-        raise BadOption(
-            f"--format {format}: is of a robot's trajectory, as `wepose retarget` writes it; {result} is none"
-        )
+        raise BadOption(f"--format {format}: is of robots, as `wepose retarget` writes them; {result} is none")
     if isinstance(result, TrackResult):
         selected = select_interval(result.time, result.phases, interval, phase)
         pose = result.pose if selected is None else result.pose.cut(find_samples(result.time, selected))

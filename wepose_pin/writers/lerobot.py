@@ -118,16 +118,12 @@ def _check_alike(motions: Sequence[JointMotion]) -> int:
     descriptions = [f"robot {each.name}, {each.rate_hz:g} Hz, joints {', '.join(each.joints)}" for each in motions]
     for other, description in zip(others, descriptions[1:], strict=True):
         if description != descriptions[0]:
-            raise BadData(
-                f"{other.where}: {description}; a data set has one robot and one rate, "
-                f"and {first.where} is of {descriptions[0]}; --rate-hz makes one rate of all"
-            )
+            reason = f"and {first.where} is of {descriptions[0]}; --rate-hz makes one rate of all"
+            raise BadData(f"{other.where}: {description}; a data set has one robot and one rate, {reason}")
     rate_hz = round(first.rate_hz)
     if not is_even(first.time) or abs(rate_hz - first.rate_hz) > 1e-3:
-        raise BadData(
-            f"{first.where}: {first.rate_hz:g} samples a second, or times that are uneven; a data set has only a whole "
-            f"number of them, which --rate-hz makes"
-        )
+        stated = f"{first.where}: {first.rate_hz:g} samples a second, or times that are uneven"
+        raise BadData(f"{stated}; a data set has a whole number of them, which --rate-hz makes")
     return rate_hz
 
 

@@ -107,10 +107,8 @@ def check_complete(motion: Motion, format_name: str) -> None:
     for segment, quat in motion.pose.quat_WL.items():
         lost = ~np.isfinite(quat).all(axis=1)
         if lost.any():
-            raise BadData(
-                f"{motion.where}: {segment} has no orientation in row {int(np.argmax(lost)) + 1} of pose.parquet; "
-                f"{format_name} needs one in every row, csv and parquet do not"
-            )
+            place = f"{motion.where}: {segment} has no orientation in row {int(np.argmax(lost)) + 1} of pose.parquet"
+            raise BadData(f"{place}; {format_name} needs one in every row, csv and parquet do not")
 
 
 def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
@@ -127,9 +125,7 @@ def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
     pose = motion.pose
     if not pose.points:
         first = motion.model.table.reference
-        raise BadData(
-            f"{motion.where}: no points in pose.parquet, for lack of a sensor on the {first}; this format needs them"
-        )
+        raise BadData(f"{motion.where}: no points in pose.parquet, for lack of a sensor on the {first}")
     points = {}
     for point, p_W in pose.points.items():
         lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]

@@ -120,16 +120,21 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
         content = parse_toml(path.read_bytes().decode("utf-8"))
     except (OSError, ValueError):
         return []  # its reader reports what is wrong
-    data, sensors, model = content.get("data"), content.get("sensors"), content.get("model")
-    tables = [
-        each for each in [data, *(sensors.values() if isinstance(sensors, dict) else ())] if isinstance(each, dict)
-    ]
-    names = [content.get("urdf"), *(table.get("file") for table in tables)]
-    names += [name for table in tables if str(name := table.get("format")).endswith(".toml")]
-    # A body of the package is part of the code.
-    names += [model] if isinstance(model, str) and (path.parent / model).is_file() else []
-    names += [data.get("truth")] if truth and isinstance(data, dict) else []
-    return sorted({name for name in names if isinstance(name, str) and name})
+    names = set()
+
+    def visit(table: Mapping[str, Any]) -> None:
+        for key, value in table.items():
+            if isinstance(value, dict):
+                visit(value)
+            elif isinstance(value, str) and (
+                key in ("urdf", "file", *(("truth",) if truth else ()))
+                or (key == "format" and value.endswith(".toml"))
+                or (key == "model" and (path.parent / value).is_file())  # a body of the package is part of the code
+            ):
+                names.add(value)
+
+    visit(content)
+    return sorted(names - {""})
 
 
 def write_provenance(folder: Path, provenance: Mapping[str, Any], name: str = "provenance.json") -> None:
@@ -165,15 +170,11 @@ def result_folder(out: Path, force: bool) -> Iterator[Path]:
     inputs = {file.resolve() for file in list_files(out, truth=True)} if (out / "session.toml").is_file() else set()
     stale = [name for name in (MODEL_TABLE, JOINTS) if (out / name).exists()]
     if stale and not any((out / name).is_file() for name in INSIDE):
-        raise ExistingOutput(
-            f"{out / stale[0]}: is of no earlier result, and would be read with the new one; rename it, or name "
-            f"another folder by -o"
-        )
+        why = "is of no earlier result, and would be read with the new one"
+        raise ExistingOutput(f"{out / stale[0]}: {why}; rename it, or name another folder by -o")
     with data_folder(out, force, [name for name in stale if (out / name).resolve() not in inputs]) as folder:
         yield folder
         for name in sorted(file.name for file in folder.iterdir()):
             if (out / name).resolve() in inputs:
-                session = out / "session.toml"
-                raise ExistingOutput(
-                    f"{out / name}: is an input of {session}, and would be replaced; name another folder by -o"
-                )
+                why = f"is an input of {out / 'session.toml'}, and would be replaced"
+                raise ExistingOutput(f"{out / name}: {why}; name another folder by -o")

@@ -202,12 +202,10 @@ def load_result(folder: str | Path) -> TrackResult:
 
 
 def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
-    """Read the phases of the recording from a result's summary; a damaged one has none."""
-    phases = {}
-    with contextlib.suppress(AttributeError, TypeError, ValueError):
-        for name, spans in summary.get("recorded_phases", {}).items():
-            phases[name] = tuple((float(begin), float(end)) for begin, end in spans)
-    return phases
+    """Read the phases of the recording from a result's summary."""
+    with library_errors(Path("summary.json"), "the summary of a result"):
+        recorded = summary.get("recorded_phases", {})
+        return {name: tuple((float(begin), float(end)) for begin, end in spans) for name, spans in recorded.items()}
 
 
 @cache
