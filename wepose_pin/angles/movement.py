@@ -50,7 +50,6 @@ class Movement:
     angles: Angles
     phases: Mapping[str, Intervals]  # of the recording, as far as they lie in the time of the pose
     repetitions: Repetitions  # found, or marked by a phase
-    measures: pl.DataFrame  # of the repetitions, as `measure_spans` has them
     curves: Mapping[str, tuple[MeanCurve, ...]]  # joint → its three mean curves; empty without repetitions
     cutoff_hz: float | None  # of the low-pass; None: there is none
 
@@ -80,9 +79,8 @@ def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], opt
     else:
         choices = one_of(phases, marked) if phases else "it has no phases; without --repetitions they are found"
         raise WrongOption("repetitions", marked, f"the recording has no such phase; {choices}")
-    measures = measure_spans(pose, angles, repetitions.spans)
     curves = compute_mean_curves(angles, repetitions.spans) if len(repetitions.spans) else {}
-    return Movement(name, pose, angles, inside, repetitions, measures, curves, options.cutoff_hz)
+    return Movement(name, pose, angles, inside, repetitions, curves, options.cutoff_hz)
 
 
 def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
@@ -107,27 +105,6 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
                     smooth[run] = filtered / np.linalg.norm(filtered, axis=1, keepdims=True)
         quat_WL[segment] = smooth
     return replace(pose, quat_WL=quat_WL, q=None)
-
-
-def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float]] | np.ndarray) -> pl.DataFrame:
-    """Build a row an angle in each span [s], both ends included: `MEASURES` in degrees, each with its ±."""
-    parts = [find_samples(pose.time, (float(begin), float(end))) for begin, end in spans]
-    rows = []
-    for order, (name, joint) in enumerate(angles.joints.items()):
-        summaries = [summarize_joint(pose.time, joint, part) for part in parts]
-        values = np.array(
-            [np.column_stack([each.lowest, each.highest, each.range, each.peak_rate]) for each in summaries]
-        ).reshape(-1, 3, len(MEASURES))
-        values[:, :, :2] -= count_turns(values[:, :, :2].mean(axis=2))[:, :, None]
-        samples = np.array([each.samples for each in summaries], dtype=int).reshape(values.shape)
-        stds = compute_summary_std(pose, name, joint, samples)
-        for span, (each, value, std) in enumerate(zip(summaries, np.degrees(values), np.degrees(stds), strict=True)):
-            for k, angle in enumerate(joint.names):
-                row = {"span": span, "order": order, "joint": name, "angle": angle, "sequence": joint.sequence}
-                for m, (measure, unit) in enumerate(MEASURES.items()):
-                    row |= {f"{measure}_{unit}": value[k, m], f"{measure}_std_{unit}": std[k, m]}
-                rows.append({**row, "near_lock": each.near_lock, "gap": each.gap})
-    return pl.DataFrame(rows).sort("span", "order", maintain_order=True).drop("order") if rows else pl.DataFrame()
 
 
 # Tables ------------------------------------------------------------------------------------------------------------
@@ -184,11 +161,10 @@ def build_phase_table(movements: Sequence[Movement]) -> pl.DataFrame:
     tables = []
     for movement in movements:
         time = movement.angles.time
-        parts = [("all", 1, (float(time[0]), float(time[-1])))]
-        parts += [(name, k, span) for name, spans in movement.phases.items() for k, span in enumerate(spans, 1)]
-        about = [{"phase": name, "number": k, "from_s": begin, "to_s": end} for name, k, (begin, end) in parts]
-        measures = measure_spans(movement.pose, movement.angles, [span for _, _, span in parts])
-        tables.append(_join(movement.name, about, measures))
+        about = [{"phase": "all", "number": 1, "from_s": float(time[0]), "to_s": float(time[-1])}]
+        for name, spans in movement.phases.items():
+            about += [{"phase": name, "number": k, "from_s": a, "to_s": b} for k, (a, b) in enumerate(spans, 1)]
+        tables.append(_tabulate_spans(movement, about))
     return pl.concat(tables)
 
 
@@ -200,16 +176,27 @@ def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
             {"repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
             for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
         ]
-        if about:
-            tables.append(_join(movement.name, about, movement.measures))
+        tables += [_tabulate_spans(movement, about)] if about else []
     return pl.concat(tables) if tables else pl.DataFrame()
 
 
-def _join(session: str, about: Sequence[Mapping[str, Any]], measures: pl.DataFrame) -> pl.DataFrame:
-    """Put what is known of each span before its measures."""
-    spans = pl.DataFrame(about).with_row_index("span").cast({"span": pl.Int64})
-    joined = spans.join(measures, on="span", maintain_order="left_right").drop("span")
-    return joined.select(pl.lit(session).alias("session"), pl.all())
+def _tabulate_spans(movement: Movement, about: Sequence[Mapping[str, Any]]) -> pl.DataFrame:
+    """Build a row an angle in each span, both ends included: what is known of it, `MEASURES`, each with its ±."""
+    pose, rows = movement.pose, [list[dict[str, Any]]() for _ in about]
+    parts = [find_samples(pose.time, (span["from_s"], span["to_s"])) for span in about]
+    for name, joint in movement.angles.joints.items():
+        summaries = [summarize_joint(pose.time, joint, part) for part in parts]
+        values = np.array([np.column_stack([s.lowest, s.highest, s.range, s.peak_rate]) for s in summaries])
+        values[:, :, :2] -= count_turns(values[:, :, :2].mean(axis=2))[:, :, None]
+        stds = compute_summary_std(pose, name, joint, np.array([each.samples for each in summaries]))
+        degrees = np.degrees(values), np.degrees(stds)
+        for own, span, summary, value, std in zip(rows, about, summaries, *degrees, strict=True):
+            for k, angle in enumerate(joint.names):
+                row = {"session": movement.name, **span, "joint": name, "angle": angle, "sequence": joint.sequence}
+                for m, (measure, unit) in enumerate(MEASURES.items()):
+                    row |= {f"{measure}_{unit}": value[k, m], f"{measure}_std_{unit}": std[k, m]}
+                own.append({**row, "near_lock": summary.near_lock, "gap": summary.gap})
+    return pl.DataFrame([row for own in rows for row in own])
 
 
 def build_summary_table(movements: Sequence[Movement], repetitions: pl.DataFrame) -> pl.DataFrame:

@@ -73,15 +73,11 @@ class PlainHelp:
                 text = f"Do not {text[0].lower()}{text[1:]}" if turns_off else text
             elif entry.default is not None:
                 text += f" (default: {entry.default})"
-            label = f"  {', '.join(names)}"
+            label, indent = f"  {', '.join(names)}", " " * _LABEL
             if entry.choices:
                 label = label.removesuffix("CHOICE") + "|".join(entry.choices)
-            if len(label) >= _LABEL:
-                label += "\n"
-            columns = textwrap.fill(
-                text, min(console.width, WIDEST), initial_indent=" " * _LABEL, subsequent_indent=" " * _LABEL
-            )
-            below = columns if label.endswith("\n") else columns[len(label) :]
+            columns = textwrap.fill(text, min(console.width, WIDEST), initial_indent=indent, subsequent_indent=indent)
+            below = f"\n{columns}" if len(label) >= _LABEL else columns[len(label) :]
             heading = f"{panel.title}:\n" if k == 0 else ""
             console.out(f"{heading}{label}{below}".rstrip(), highlight=False)
         if panel.entries:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -55,13 +55,7 @@ STYLE: Any = {
     "svg.hashsalt": "wepose",
 }
 Spans = Iterable[Sequence[float]] | np.ndarray
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Draw in the style of the reports, whatever the caller's rcParams."""
-    return mpl.rc_context(STYLE)(draw)
+styled = mpl.rc_context(STYLE)  # decorates what draws in the style of the reports, whatever the caller's rcParams
 
 
 class ReportFigure(Figure):

@@ -50,7 +50,7 @@ def render_retargeting_report(
         ],
         {
             "The hands against their targets": [draw_hands(trajectory), *tabulate_hands(summary)],
-            "The robot's parts against each other": [_describe_distances(trajectory, summary)],
+            "The robot's parts against each other": [_describe_distances(summary)],
             "The joints against their limits": _list_joints(trajectory, summary),
             "The motion in 3D": [] if view is None else [Frame(view, " Translucent: the targets of the hands.")],
             "What was run": [tabulate_run(summary)],
@@ -86,14 +86,12 @@ def tabulate_hands(summary: Mapping[str, Any]) -> list[Table]:
     """Errors of the hands, and their causes."""
     arms, rows = summary["arms"], []
     for side, arm in arms.items():
-        swivel, errors = arm["swivel_error_deg"], (arm["hand_error_everywhere_mm"], arm["hand_error_mm"])
-        cells = [number(error[key], 1) if error else "" for error in errors for key in ("median", "p90")]
-        rotation = number(arm["hand_error_deg"]["median"], 1)
-        swivel_deg = number(swivel["median"], 0) if swivel else ""
-        rows.append([side, f"{arm['scale']:.2f}", *cells, rotation, swivel_deg])
-    places = ("median", "90 %", "within reach: median", "90 %")
+        swivel = number(arm["swivel_error_deg"]["median"], 0) if arm["swivel_error_deg"] else ""
+        error = arm["hand_error_everywhere_mm"]
+        distances = [number(error[key], 1) if error else "" for key in ("median", "p90")]
+        rows.append([side, f"{arm['scale']:.2f}", *distances, number(arm["hand_error_deg"]["median"], 1), swivel])
     causes = [[cause, *(f"{100.0 * arm['error_attribution'][cause]:.1f}" for arm in arms.values())] for cause in CAUSES]
-    header = ["arm", "scale", *places, "orientation [deg]", "elbow swivel [deg]"]
+    header = ["arm", "scale", "median", "90 %", "orientation [deg]", "elbow swivel [deg]"]
     title = f"Share of the time in which a hand is over {1e3 * FAR:g} mm off, by cause; the first that applies counts"
     return [
         Table("Distance of each hand from its target [mm]", header, rows),
@@ -101,17 +99,15 @@ def tabulate_hands(summary: Mapping[str, Any]) -> list[Table]:
     ]
 
 
-def _describe_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> str:
-    distance, contacts = trajectory.run.report.hull_distance, summary["self_collisions"]
-    text = "Distances are those of convex hulls, which are larger than the parts."
-    if np.isfinite(distance).any():
-        k = int(np.nanargmin(distance))
-        pair = trajectory.collision.name_pair(int(trajectory.run.report.nearest_pair[k]))
+def _describe_distances(summary: Mapping[str, Any]) -> str:
+    contacts = summary["self_collisions"]
+    text = f"The parts, {contacts['pairs']} pairs of them, collide in {contacts['samples']} samples."
+    if (least := contacts["min_hull_distance_mm"]) is not None:
         text += (
-            f" The least is {1e3 * distance[k]:.1f} mm, of {pair} at {trajectory.time[k]:.1f} s; the controller keeps "
+            f" The least distance of their convex hulls, which are larger, is {least:.1f} mm; the controller keeps "
             f"{1e3 * CLEARANCE:g} mm."
         )
-    return text + f" The parts themselves, {contacts['pairs']} pairs of them, collide in {contacts['samples']} samples."
+    return text
 
 
 def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:

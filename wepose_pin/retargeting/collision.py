@@ -112,10 +112,6 @@ class CollisionModel:
         jacobian = _compute_distance_jacobian(distance, a, b, J, self._supports[first], self._supports[second])
         return NearPairs(indices, distance, jacobian, self.clearance[indices])
 
-    def name_pair(self, pair: int) -> str:
-        """The names of the two shapes of a pair."""
-        return " and ".join(self.hulls.geometryObjects[shape].name for shape in self.pairs[pair])
-
     def compute_distances(self, data: Any, pairs: np.ndarray) -> np.ndarray:
         """Distances [m] of some `pairs` (indices); `data` of the model holds joint placements."""
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)

@@ -82,7 +82,6 @@ class StepReport(NamedTuple):
     """What determined a step, or many."""
 
     hull_distance: Any  # (…) [m] between convex hulls; inf where none were near
-    nearest_pair: Any  # (…) int, of `CollisionModel.pairs`, to which that belongs; -1: none
     stopping: Any  # (…) bool: no step kept all limits and left a stop open, the robot took one of its stop
     limited: Any  # (…, n) bool: the joint was at a bound of its own
     near_contact: Any  # (…, n) bool: the joint must not bring shapes nearer to each other
@@ -237,15 +236,9 @@ class QpController:
         return after
 
     def _report_step(self, near: NearPairs, stopping: bool) -> None:
-        k = int(np.argmin(near.distance)) if len(near.pairs) else -1
         moved = (np.abs(self._active_rows) > _MIN_DISTANCE_JACOBIAN).any(axis=0) | stopping
-        self.report = StepReport(
-            float(near.distance[k]) if k >= 0 else np.inf,
-            int(near.pairs[k]) if k >= 0 else -1,
-            stopping,
-            self._limited & (not stopping),
-            moved,
-        )
+        distance = float(np.min(near.distance, initial=np.inf))
+        self.report = StepReport(distance, stopping, self._limited & (not stopping), moved)
 
 
 def integrate(state: JointState, acceleration: np.ndarray, dt: float) -> JointState:
