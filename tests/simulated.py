@@ -10,6 +10,7 @@ from wepose_pin import Simulation
 
 G = 9.81
 SIDES = ("left", "right")
+SEGMENTS = ("torso", *(f"{side}_{part}" for side in SIDES for part in ("upper_arm", "forearm")))
 # Left and right differ, so that a swap shows.
 SUBJECT = {
     "trunk": 0.50,

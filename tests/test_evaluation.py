@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.kinematics import Pose, build_pose_table, parse_pose_table
-from wepose_pin.errors import WeposeError
-from wepose_pin.evaluation import evaluate, uncertainty
+from wepose_pin import Pose, WeposeError, evaluate
 
 TIME = np.arange(101) / 10.0
 
@@ -57,6 +56,29 @@ def test_the_error_of_a_joint_is_that_of_its_angles() -> None:
     assert errors["right_elbow"]["flexion"][:3] == pytest.approx((3.0, 3.0, 3.0), abs=1e-9)
     assert errors["right_elbow"]["carrying_angle"][:3] == pytest.approx((-2.0, 2.0, 2.0), abs=1e-9)
     assert errors["right_elbow"]["pronation"][:3] == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+
+
+def test_agreement_is_bland_and_altmans_and_the_icc_that_of_shrout_and_fleiss() -> None:
+    """ICC(2,1) of two raters, by the mean squares of their analysis of variance."""
+    true = np.linspace(-40.0, 60.0, 101)
+    rated = true + 3.0 + np.where(np.arange(101) % 2, 1.0, -1.0)
+
+    def arm(flexion_deg: np.ndarray) -> Pose:
+        forearm = Rotation.from_euler("y", -flexion_deg[:, None], degrees=True).as_quat()
+        upper = np.tile([0.0, 0.0, 0.0, 1.0], (101, 1))
+        return Pose(TIME, {"right_upper_arm": upper, "right_forearm": forearm}, {})
+
+    agreement = evaluate(arm(rated), arm(true)).joints["right_elbow"]["flexion"]
+    assert (agreement.mean, agreement.rmse) == pytest.approx((3.0, np.sqrt(10.0)), abs=0.02)
+    assert (agreement.lower, agreement.upper) == pytest.approx((3.0 - 1.96, 3.0 + 1.96), abs=0.03)
+    assert agreement.range == pytest.approx(100.0)
+    ratings = np.column_stack([rated, true])
+    n, k, mean = 101, 2, ratings.mean()
+    rows = k * np.sum((ratings.mean(axis=1) - mean) ** 2) / (n - 1)
+    raters = n * np.sum((ratings.mean(axis=0) - mean) ** 2) / (k - 1)
+    rest = (np.sum((ratings - mean) ** 2) - rows * (n - 1) - raters * (k - 1)) / ((n - 1) * (k - 1))
+    icc = (rows - rest) / (rows + (k - 1) * rest + k * (raters - rest) / n)
+    assert agreement.icc == pytest.approx(icc, abs=1e-4)
 
 
 def test_near_the_lock_there_is_no_error_of_an_angle() -> None:
@@ -115,27 +137,28 @@ def test_heading_inclination_and_drift() -> None:
     assert error.total_rmse == pytest.approx(np.hypot(error.inclination_rmse, error.heading_rmse), rel=1e-3)
 
 
+def judge(error: np.ndarray, cov: np.ndarray) -> Any:
+    """What is said of errors (n, 3) [m] of a point whose stated covariances are (n, 3, 3)."""
+    time = np.arange(len(error)) / 100.0
+    torso = np.tile([0.0, 0.0, 0.0, 1.0], (len(error), 1))
+    off, true = (Pose(time, {"torso": torso}, {"left_palm": p}) for p in (error, np.zeros_like(error)))
+    return evaluate(replace(off, point_cov={"left_palm": cov}), true).position_uncertainty["left_palm"]
+
+
 def test_stated_uncertainty_is_judged() -> None:
     rng = np.random.default_rng(0)
     n = 20000
-    cov = np.diag([1.0, 4.0, 9.0]) + 0.5
+    cov = 1e-4 * (np.diag([1.0, 4.0, 9.0]) + 0.5)
     draws = rng.multivariate_normal(np.zeros(3), cov, n)
-    right = uncertainty(draws, np.tile(cov, (n, 1, 1)))
+    right = judge(draws, np.tile(cov, (n, 1, 1)))
     assert right.nees == pytest.approx(3.0, abs=0.1)
     assert right.within_1 == pytest.approx(0.683, abs=0.01)
     assert right.within_2 == pytest.approx(0.954, abs=0.01)
-    assert uncertainty(draws, np.tile(cov / 4, (n, 1, 1))).nees == pytest.approx(12.0, abs=0.4)
-
-
-def test_uncertainty_goes_through_the_table() -> None:
-    cov = np.tile(np.diag([1e-4, 4e-4, 9e-4]), (101, 1, 1))
-    stated = replace(pose((0.5, 0.5, 0.5), (0.01, 0.0, 0.0)), segment_cov={"torso": cov}, point_cov={"left_palm": cov})
-    whole = evaluate(parse_pose_table(build_pose_table(stated, covariance=True), "t"), pose())
-    assert whole.position_uncertainty["left_palm"].nees == pytest.approx(1.0)
-    direct = evaluate(stated, pose()).attitude_uncertainty["torso"]
-    assert whole.attitude_uncertainty["torso"] == pytest.approx(direct)
-    rough = evaluate(parse_pose_table(build_pose_table(stated), "t"), pose())
-    assert rough.position_uncertainty["left_palm"].nees == pytest.approx(1e-4 / (14e-4 / 3))
+    assert judge(draws, np.tile(cov / 4, (n, 1, 1))).nees == pytest.approx(12.0, abs=0.4)
+    turned = replace(
+        pose((0.5, 0.5, 0.5)), segment_cov={"torso": np.tile(np.deg2rad(0.5) ** 2 * np.eye(3), (101, 1, 1))}
+    )
+    assert evaluate(turned, pose()).attitude_uncertainty["torso"].nees == pytest.approx(3.0, abs=0.1)
     assert evaluate(pose(), pose()).position_uncertainty == {}
 
 
@@ -155,4 +178,4 @@ def test_a_covariance_without_an_error_in_some_direction_is_left_out() -> None:
     singular = sound.copy()
     singular[1:3] = 1e-4 * np.diag([1.0, 1.0, 0.0])
     singular[2, 2, 2] = 1e-22
-    assert uncertainty(error, singular) == uncertainty(error[[0, 3]], sound[[0, 3]])
+    assert judge(error, singular) == judge(error[[0, 3]], sound[[0, 3]])

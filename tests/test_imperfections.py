@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from simulated import SUBJECT, G, multiply
+from simulated import SEGMENTS, SUBJECT, G, multiply
 
 from benchmarks.validation.single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
-from wepose_pin.readers import load_session
-from wepose_pin.recording import ImuSensor, Recording, compute_mount
-from wepose_pin.simulation import (
+from wepose_pin import (
     IDEAL_PRESET,
     NOISE_FREE,
     PEOPLE_PRESET,
-    SEGMENTS,
     Imperfections,
+    ImuSensor,
+    Recording,
     Simulation,
+    load_session,
     simulate,
 )
 from wepose_pin.writers import write_session
@@ -124,9 +124,8 @@ def test_clocks_shift_the_samples_in_the_data() -> None:
 def test_lost_samples_are_bridged_as_in_a_users_file(people: Simulation, tmp_path: Path) -> None:
     recorded = people.recording()
     raw = {
-        segment: ImuSensor(people.gyro_S[segment], people.accel_S[segment], compute_mount(*mount))
-        for segment, mount in people.stated_mount.items()
-        if mount is not None
+        segment: ImuSensor(people.gyro_S[segment], people.accel_S[segment], sensor.stated_quat_LS)
+        for segment, sensor in recorded.sensors.items()
     }
     assert sum(np.isnan(sensor.gyro_S[:, 0]).sum() for sensor in raw.values()) > 10
     write_session(tmp_path, Recording("raw", recorded.time, recorded.rate_hz, raw, recorded.phases))
