@@ -155,9 +155,8 @@ def test_stated_uncertainty_is_judged() -> None:
     assert right.within_1 == pytest.approx(0.683, abs=0.01)
     assert right.within_2 == pytest.approx(0.954, abs=0.01)
     assert judge(draws, np.tile(cov / 4, (n, 1, 1))).nees == pytest.approx(12.0, abs=0.4)
-    turned = replace(
-        pose((0.5, 0.5, 0.5)), segment_cov={"torso": np.tile(np.deg2rad(0.5) ** 2 * np.eye(3), (101, 1, 1))}
-    )
+    cov = np.tile(np.deg2rad(0.5) ** 2 * np.eye(3), (101, 1, 1))
+    turned = replace(pose((0.5, 0.5, 0.5)), segment_cov={"torso": cov})
     assert evaluate(turned, pose()).attitude_uncertainty["torso"].nees == pytest.approx(3.0, abs=0.1)
     assert evaluate(pose(), pose()).position_uncertainty == {}
 
