@@ -5,18 +5,17 @@ from __future__ import annotations
 import io
 import json
 import struct
+import tempfile
 import zlib
 from pathlib import Path
 
+import device_files as df
 import numpy as np
 import polars as pl
 from mcap.writer import Writer
 from scipy.io import savemat
 
 import wepose_pin
-from wepose_pin.assets import asset
-from wepose_pin.body.subject import population_subject, subject_toml
-from wepose_pin.live.sources.udp import CRC, HEADER, MAGIC, SAMPLE
 
 N = 12
 TIME = np.arange(N) / 100.0
@@ -85,7 +84,6 @@ shoulder = { link = "upper" }
 elbow = { link = "fore" }
 hand = { link = "hand", offset = [0.0, 0.0, -0.1], fingers = "-z", thumb = "+x" }
 """
-SRDF = b"""<robot name="arm"><disable_collisions link1="base" link2="upper" reason="Adjacent"/></robot>"""
 
 
 def table() -> pl.DataFrame:
@@ -117,47 +115,6 @@ def rows(*columns: np.ndarray, separator: str = ",") -> str:
     return "".join(separator.join(map(text, row)) + "\n" for row in np.column_stack(columns))
 
 
-def mvnx(raw: bool) -> bytes:
-    more = "<sensorAcceleration>0 0 9.81</sensorAcceleration><sensorAngularVelocity>0.1 0 0</sensorAngularVelocity>"
-    frame = '<frame time="{}" index="{}" type="{}"><orientation>1 0 0 0 0.8 0.6 0 0</orientation>{}</frame>'
-    frames = frame.format(0, "", "tpose", "")
-    frames += "".join(frame.format(10 * k, k, "normal", more if raw else "") for k in range(3))
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?><mvnx version="4"><subject frameRate="100"><segments>'
-        '<segment label="T8" id="1"/><segment label="LeftUpperArm" id="2"/></segments><sensors><sensor label="T8"/>'
-        f"</sensors><frames>{frames}</frames></subject></mvnx>"
-    ).encode()
-
-
-def mt_manager() -> list[bytes]:
-    head = "// Update Rate: 100.0Hz\n"
-    counter = np.arange(N) + 65530.0
-    raw = "\t".join(["PacketCounter", "SampleTimeFine", *(f"{k}_{a}" for k in ("Acc", "Gyr") for a in "XYZ")])
-    quat = ";".join(["PacketCounter", "Quat_q0", "Quat_q1", "Quat_q2", "Quat_q3"])
-    euler = ",".join(["PacketCounter", "SampleTimeFine", "Roll", "Pitch", "Yaw"])
-    texts = (
-        head + raw + "\n" + rows(counter % 65536, 100 * counter, ACCEL, GYRO, separator="\t"),
-        head + quat + "\n" + rows(counter, QUAT[:, [3, 0, 1, 2]], separator=";").replace(".", ","),
-        "// a: b\n" + euler + "\n" + rows(counter, 100 * counter, 10 * GYRO),
-    )
-    return [text.encode() for text in texts]
-
-
-def dot() -> list[bytes]:
-    head = "sep=,\nDeviceTag:,left_wrist\nSyncStatus:,Synced\nOutputRate:,100Hz\n\n"
-    count, fine = np.arange(N), 10000 * np.arange(N) + 2**32 - 50000.0
-    names = {
-        "Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z": (ACCEL, GYRO),
-        "dq_W,dq_X,dq_Y,dq_Z,dv[1],dv[2],dv[3]": (np.tile([1.0, 0.0, 0.001, 0.0], (N, 1)), ACCEL / 100),
-        "Euler_X,Euler_Y,Euler_Z": (10 * GYRO,),
-    }
-    texts = [
-        f"{head}PacketCounter,SampleTimeFine,{name}\n{rows(count, fine % 2**32, *values)}"
-        for name, values in names.items()
-    ]
-    return [text.encode() for text in texts]
-
-
 def wild_csv() -> bytes:
     """As a spreadsheet writes it: remarks, semicolons, decimal commas, units in a line of their own."""
     units = ";".join(["s", *["rad/s"] * 3, *["m/s^2"] * 3])
@@ -168,45 +125,11 @@ def tabled(separator: str, decimal: str, *columns: np.ndarray) -> str:
     return rows(*columns).replace(",", separator).replace(".", decimal)
 
 
-def descriptions() -> list[bytes]:
-    folder = Path(wepose_pin.__file__).parent / "readers" / "formats"
-    return [(folder / "dot.toml").read_bytes()]
-
-
-def xdf() -> bytes:
-    def chunk(tag: int, content: bytes) -> bytes:
-        return b"\x04" + struct.pack("<IH", len(content) + 2, tag) + content
-
-    labels = "".join(f"<channel><label>{name}</label><unit/></channel>" for name in NAMES)
-    info = "<channel_count>6</channel_count><nominal_srate>100</nominal_srate><channel_format>double64</channel_format>"
-    head = f"<info><name>torso</name>{info}<desc><channels>{labels}</channels></desc></info>".encode()
-    samples = b"".join(b"\x08" + struct.pack("<7d", *row) for row in np.column_stack([TIME, GYRO, ACCEL]))
-    data = chunk(1, b"<info/>") + chunk(2, struct.pack("<I", 1) + head)
-    data += chunk(3, struct.pack("<IBB", 1, 1, N) + samples) + chunk(4, struct.pack("<Idd", 1, 0.0, 0.1))
-    return b"XDF:" + data + chunk(6, struct.pack("<I", 1) + b"<info><sample_count>12</sample_count></info>")
-
-
 def trc() -> bytes:
     names = "\t\t\t".join(("LSHO", "RSHO", "LELB"))
     keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
     head = f"PathFileType\t4\t(X/Y/Z)\ta.trc\n{keys}\n100\t100\t{N}\t3\tmm\nFrame#\tTime\t{names}\n\t\tX1\n"
     return (head + tabled("\t", ".", np.arange(N), TIME, 100 * ACCEL, 90 * ACCEL, 50 * ACCEL)).encode()
-
-
-MARKERS = b"""[points]
-"{side}_elbow" = [["{S}E1", "{S}E2"], ["LELB"]]
-[segments]
-torso = [{ up = [["A"], ["LSHO"]], left = [["RSHO"], ["LSHO"]] }]
-[rotations]
-torso = "trunk"
-"""
-
-
-def opensim() -> bytes:
-    lines = [f"{t:.3f}\t0.8,0,0.6,0\t1,0,0,0\n" for t in TIME]
-    return (
-        "DataRate=100\nDataType=Quaternion\nversion=3\nendheader\ntime\ttorso_imu\thumerus_r_imu\n" + "".join(lines)
-    ).encode()
 
 
 def live_log() -> bytes:
@@ -238,10 +161,9 @@ def live_log() -> bytes:
 def datagrams() -> list[bytes]:
     one = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}
     two = {"sensor": "head", "t": [1, 2.5], "gyro": [[0.1, 0, 0], [0, 0, 1]], "accel": [[0, 0, 9], [0, 0, 9]]}
-    samples = np.zeros(2, SAMPLE)
-    body = HEADER.pack(MAGIC, 1, 3, 2, 1.5) + samples.tobytes()
+    body = struct.pack("<4sBBHd14f", b"WPIN", 1, 3, 2, 1.5, *[0.0] * 14)
     lines = "\n".join(json.dumps(message) for message in (one, two)).encode()
-    return [json.dumps(one).encode(), lines, body + CRC.pack(zlib.crc32(body))]
+    return [json.dumps(one).encode(), lines, body + struct.pack("<I", zlib.crc32(body))]
 
 
 def pose() -> bytes:
@@ -257,7 +179,9 @@ def pose() -> bytes:
 
 
 def subject() -> bytes:
-    return subject_toml(population_subject()).encode() + (
+    with tempfile.TemporaryDirectory() as folder:
+        own = wepose_pin.population_subject().save(Path(folder) / "subject.toml").read_bytes()
+    return own + (
         b"[mounts.torso]\nqx = 0.0\nqy = 0.0\nqz = 0.0\nqw = 1.0\n"
         b"[hinges.left_elbow]\nx = 0.0\ny = 1.0\nz = 0.0\nstd_deg = 5.0\n"
         b"[start_pose_offset.torso]\nx_deg = 1.0\ny_deg = 2.0\nstd_deg = 1.0\n"
@@ -267,7 +191,21 @@ def subject() -> bytes:
 
 def shipped(*names: str) -> list[bytes]:
     """Files of ours, as they are."""
-    return [Path(asset(*name.split("/", 1))).read_bytes() for name in names]
+    return [(Path(wepose_pin.__file__).parents[1] / name).read_bytes() for name in names]
+
+
+def device(format: str) -> bytes:
+    """A file of a maker, of which forty rows say enough."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = df.mvnx(Path(folder), df.turning(), raw=True) if format == "mvnx" else df.make(format, Path(folder))
+        data = path.read_bytes()
+    return data if format in ("xdf", "mvnx") else b"".join(data.splitlines(keepends=True)[:50])
+
+
+def increments() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        data = df.dot(Path(folder) / "a.csv", "increments").read_bytes()
+    return b"".join(data.splitlines(keepends=True)[:50])
 
 
 # What wepose wrote --------------------------------------------------------------------------------------------------

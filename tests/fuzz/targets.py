@@ -7,12 +7,17 @@ Parquet, MATLAB, HDF5 and C3D are not here: libraries parse them, and some of th
 
 from __future__ import annotations
 
+import socket
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from wepose_pin.errors import WeposeError
+from sampling import find_free_port
+
+import wepose_pin as wp
+from wepose_pin import WeposeError
+from wepose_pin.live.sources import open_source
 
 from . import seeds
 
@@ -59,11 +64,15 @@ def file(name: str, read: Callable[[Path], object]) -> Callable[[Path, bytes], o
 
 
 def _datagram(_folder: Path, data: bytes) -> object:
-    from wepose_pin.live.sources.udp import decode
-
-    decoded = list(decode(data))
-    assert all(each.isprintable() for each in decoded if isinstance(each, str)), decoded
-    return decoded
+    port = find_free_port()
+    source = open_source(f"udp:{port}", sensors=["torso", "head"])
+    source.open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(data[:60_000], ("127.0.0.1", port))
+    samples = source.read(0.01)
+    source.close()
+    assert all(problem.isprintable() for problem in source.problems), source.problems
+    return samples
 
 
 KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".toml", ".mcap")
@@ -84,9 +93,9 @@ def _described(folder: Path, data: bytes) -> object:
 def _described_seeds() -> list[bytes]:
     """One of each kind."""
     of = {
-        ".csv": [seeds.csv(), seeds.wild_csv(), *seeds.dot()],
-        ".txt": seeds.mt_manager(),
-        **{".sto": [seeds.opensim()], ".mvnx": [seeds.mvnx(True)], ".xml": [seeds.mvnx(False)]},
+        ".csv": [seeds.csv(), seeds.wild_csv(), seeds.device("dot")],
+        ".txt": [seeds.device("mt_manager")],
+        **{".sto": [seeds.device("opensim")], ".mvnx": [seeds.device("mvnx")], ".xml": [seeds.device("mvnx")]},
         ".toml": [seeds.subject()],
     }
     return [bytes([KINDS.index(kind)]) + text for kind, texts in of.items() for text in texts]
@@ -96,19 +105,15 @@ def _session(data_file: str, session: str) -> Callable[[Path, bytes], object]:
     """The input is the data; a session that is well names it."""
 
     def run(folder: Path, data: bytes) -> object:
-        from wepose_pin.readers import load_session
-
         (folder / data_file).write_bytes(data)
         (folder / "session.toml").write_text(session, encoding="utf-8")
-        return load_session(folder / "session.toml", gaps=True)
+        return wp.load_session(folder / "session.toml", gaps=True)
 
     return run
 
 
 def _session_text(folder: Path, data: bytes) -> object:
     """The input is the session; the data that it may name are well."""
-    from wepose_pin.readers import load_session
-
     for name, content in (
         ("arm.csv", seeds.csv),
         ("arm.parquet", seeds.parquet),
@@ -117,7 +122,7 @@ def _session_text(folder: Path, data: bytes) -> object:
         if not (folder / name).is_file():
             (folder / name).write_bytes(content())
     (folder / "session.toml").write_bytes(data)
-    return load_session(folder / "session.toml")
+    return wp.load_session(folder / "session.toml")
 
 
 def _reference(path: Path) -> object:
@@ -126,32 +131,15 @@ def _reference(path: Path) -> object:
     return read_reference(path)
 
 
-def _markers(path: Path) -> object:
-    from wepose_pin.readers.reference import read_reference
-
-    (path.parent / "a.trc").write_bytes(seeds.trc())
-    return read_reference(path.parent / "a.trc", path)
-
-
 def _subject(path: Path) -> object:
-    from wepose_pin.body.subject import load_subject, subject_toml
-
-    return subject_toml(load_subject(path))
+    subject = wp.load_subject(path)
+    return subject.save(path.parent / "again.toml", force=True)
 
 
 def _table(path: Path) -> object:
-    from wepose_pin.body import load_model
-
     if not (path.parent / "upper_body.urdf").is_file():
         (path.parent / "upper_body.urdf").write_bytes(seeds.shipped("urdf/upper_body.urdf")[0])
-    return load_model(path)
-
-
-def _description(path: Path) -> object:
-    from wepose_pin.readers.table_format import load_format
-
-    (path.parent / "a.csv").write_bytes(seeds.dot()[1])
-    return load_format(path).read(path.parent / "a.csv")
+    return wp.load_model(path)
 
 
 def _robot_map(path: Path) -> object:
@@ -159,12 +147,6 @@ def _robot_map(path: Path) -> object:
 
     (path.parent / "arm.urdf").write_text(seeds.URDF, encoding="utf-8")
     return read_map(path)
-
-
-def _setup(path: Path) -> object:
-    from wepose_pin.live.setup import read_setup
-
-    return read_setup(path)
 
 
 def _retargeted(path: Path) -> object:
@@ -176,38 +158,14 @@ def _retargeted(path: Path) -> object:
     return CollisionModel(load_robot(find_map(str(path))))
 
 
-def _srdf(path: Path) -> object:
-    from wepose_pin.retargeting.collision import read_disabled_pairs
-
-    return read_disabled_pairs(path)
-
-
 def _protocol(path: Path) -> object:
-    from wepose_pin.calibration.protocols import load_protocol
+    from wepose_pin.calibration import load_protocol
 
     return load_protocol(path)
 
 
 def _body(path: Path) -> object:
-    from wepose_pin.body import load_model
-
-    return load_model(path).visuals
-
-
-def _robot(path: Path) -> object:
-    from wepose_pin.body.body import load_sensed_model
-
-    return load_sensed_model(path, ("upper", "tool"), "session.toml")
-
-
-def _live(path: Path) -> object:
-    from wepose_pin.body.subject import parse_subject
-    from wepose_pin.readers import read_live_log
-
-    log = read_live_log(path)
-    if log.header["subject"]:
-        parse_subject(log.header["subject"], path)
-    return log
+    return wp.load_model(path).visuals
 
 
 def _pose(path: Path) -> object:
@@ -279,27 +237,22 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 
 TARGETS = (
     Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES),
-    Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML),
-    Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES),
-    Target("dot", seeds.dot, _device("a.csv", "dot"), LINES),
-    Target("description", seeds.descriptions, file("lab.toml", _description), TOML),
-    Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), ()),
+    Target("mvnx", lambda: [seeds.device("mvnx")], _device("a.mvnx", "mvnx"), XML),
+    Target("mt_manager", lambda: [seeds.device("mt_manager")], _device("a.txt", "mt_manager"), LINES),
+    Target("dot", lambda: [seeds.device("dot"), seeds.increments()], _device("a.csv", "dot"), LINES),
+    Target("xdf", lambda: [seeds.device("xdf")], _device("a.xdf", "xdf"), ()),
     Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES),
-    Target("markers", lambda: [seeds.MARKERS], file("m.toml", _markers), TOML),
-    Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES),
+    Target("opensim", lambda: [seeds.device("opensim")], _device("a.sto", "opensim"), LINES),
     Target("info", _described_seeds, _described, LINES),
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML),
-    Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML),
     Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML),
     Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML),
     Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML),
     Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML),
     Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML),
-    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML),
     Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML),
-    Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML),
     Target("datagram", seeds.datagrams, _datagram, JSON),
-    Target("live_log", lambda: [seeds.live_log()], file("a.mcap", _live), JSON),
+    Target("live_log", lambda: [seeds.live_log()], file("a.mcap", wp.load_session), JSON),
     Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), ()),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON),
 )
