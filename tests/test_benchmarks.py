@@ -7,13 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import filters
 from benchmarks.__main__ import main
 from benchmarks.bodies import XSENS_JOINTS, measure_mvnx, measure_ring_links, measure_ring_orientations
-from benchmarks.tables import is_installed
-from wepose_pin.filters import METHODS
 
-TINY = filters.Effort(2, 8.0, 1.0, 10.0, (1, 3))
 MOUNTS = ["rigid", pytest.param("loose", marks=pytest.mark.slow)]
 # [mm] mean and largest distance of a point, a tenth above what was found. All of it is where the shoulders are from the
 # hips. Our trunk is one segment that turns as T8. The 66-DoF spine bends, but its pelvis is the root and stays upright:
@@ -23,21 +19,6 @@ MVNX_BOUNDS = {"upper_body": (79.0, 88.0), "humanSubject01_66dof": (55.0, 61.0)}
 
 def run(*words: object) -> int:
     return main([str(word) for word in words])
-
-
-@pytest.mark.slow
-def test_every_method_is_measured() -> None:
-    one_call = filters.measure_filters(TINY)
-    assert set(one_call.rows) >= {*METHODS, *(f"{name}, inner run" for name in METHODS)}
-    live = filters.measure_live(TINY)
-    assert {"smekf, 1 sensor", "amekf, 3 sensors", "ncf, 3 sensors"} <= set(live.rows)
-    assert set(filters.measure_calls(TINY).rows) == {"track", "calibrate"}
-    for table in (one_call, live):
-        assert table.notes[-1].startswith("No ratios") != is_installed("vqf")
-        for row in table.rows.values():
-            assert set(row) == {column.key for column in table.columns}
-    if is_installed("vqf"):
-        assert one_call.rows["VQF"]["ratio"] == 1.0
 
 
 def test_what_cannot_be_measured_is_one_line(

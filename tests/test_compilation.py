@@ -6,12 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
-
-import pytest
-from numba import njit
-
-from wepose_pin import compilation
 
 _FIRST_USE = """
 import numpy as np
@@ -44,14 +38,3 @@ def test_compiled_once_and_kept(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_no_error(tmp_path: Path) -> None:
     assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
-
-
-def test_nowhere_to_keep_what_is_compiled_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def without_a_folder(**options: Any) -> Any:
-        if options.pop("cache", False):
-            raise RuntimeError("cannot cache function: no locator available")
-        return njit(**options)
-
-    monkeypatch.setattr(compilation, "njit", without_a_folder)
-    for decorator in (compilation.compiled, compilation.kernel):
-        assert decorator(lambda x: x + 1.0)(1.0) == 2.0

@@ -35,14 +35,6 @@ ALLOWED = {
     "simulation/": "simulated people and activities",
 }
 
-# Of these only the tables name them: no function does.
-TABLES_ALONE = (
-    "live/sources/udp.py",
-    "live/sources/slimevr.py",
-    "readers/mvnx.py",
-    "writers/bvh.py",
-)
-
 
 def find_strings(text: str) -> Iterator[tuple[int, str]]:
     """Line and text of each string and each piece of an f-string, docstrings left out."""
@@ -79,7 +71,6 @@ def find_identifiers(text: str) -> Iterator[tuple[int, str]]:
 
 
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
-PAGES = [path for path in sorted(PACKAGE.rglob("*.*")) if path.suffix in (".js", ".j2", ".css", ".html")]
 
 
 def covers(allowed: str, file: str) -> bool:
@@ -89,19 +80,6 @@ def covers(allowed: str, file: str) -> bool:
 @pytest.mark.parametrize("file", [name for name in FILES if not any(covers(each, name) for each in ALLOWED)])
 def test_no_name_of_a_body(file: str) -> None:
     assert find_names(FILES[file].read_text(encoding="utf-8")) == []
-
-
-def test_no_name_of_a_body_in_pages_and_scripts() -> None:
-    assert len(PAGES) > 5
-    assert {path.name: found for path in PAGES if (found := IDENTIFIER.findall(path.read_text(encoding="utf-8")))} == {}
-
-
-@pytest.mark.parametrize("file", TABLES_ALONE)
-def test_names_of_formats_stand_in_tables(file: str) -> None:
-    text = FILES[file].read_text(encoding="utf-8")
-    functions = [each for each in ast.walk(ast.parse(text)) if isinstance(each, ast.FunctionDef)]
-    spans = [range(each.lineno, (each.end_lineno or each.lineno) + 1) for each in functions]
-    assert [name for name in find_names(text) if any(name[0] in span for span in spans)] == []
 
 
 @pytest.mark.parametrize("allowed", ALLOWED)

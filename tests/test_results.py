@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 
 from benchmarks.results import adapter, inputs, saving, tasks
 from benchmarks.results.__main__ import main
-from benchmarks.results.arrays import Arrays, file_values, folder_values
+from benchmarks.results.arrays import Arrays
 from benchmarks.results.comparison import difference_of
 
 
@@ -30,25 +28,6 @@ def write(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return write
-
-
-def test_numbers_of_files(tmp_path: Path) -> None:
-    pl.DataFrame({"time": [0.0, 0.1], "gap": [True, False], "name": ["a", "b"]}).write_parquet(
-        tmp_path / "pose.parquet"
-    )
-    (tmp_path / "summary.json").write_text(json.dumps({"rate_hz": 100, "provenance": {"format": 1}, "method": "amekf"}))
-    (tmp_path / "subject.toml").write_text("[lengths]\ntrunk = 0.5\n")
-    (tmp_path / "a.trc").write_text("PathFileType\t4\n1\t-0.5\t1e-3\tnan\t3D\n")
-    (tmp_path / "a.urdf").write_text('<robot><!-- 0.1.0 of 2024 --><origin xyz="0 0 1.5"/></robot>')
-    (tmp_path / "view.html").write_text("1 2 3")
-    values = folder_values(tmp_path, "track")
-    expected = {"track/time", "track/gap", "track/summary/rate_hz", "track/subject/lengths/trunk"}
-    assert set(values) == {*expected, "track/a.trc", "track/a.urdf"}
-    np.testing.assert_array_equal(values["track/a.trc"], [4.0, 1.0, -0.5, 1e-3, np.nan])
-    assert values["track/a.urdf"].tolist() == [0.0, 0.0, 1.5]
-    (tmp_path / "a.odd").touch()
-    with pytest.raises(ValueError, match=r"a\.odd"):
-        file_values(tmp_path / "a.odd", "a")
 
 
 def test_one_bit_is_a_difference() -> None:
@@ -121,12 +100,3 @@ def test_two_saves_are_bit_identical(
     assert "0 different, 0 missing, 0 new" in capsys.readouterr().out
     keys = set(np.load(a / "results" / "chain.npz").files)
     assert {"track/chain/amekf/whole/joints/elbow", "track/chain/amekf/whole/exit_code"} <= keys
-
-
-@pytest.mark.usefixtures("few")
-def test_a_command_that_fails_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(adapter, "track", lambda *_, **__: ["track", "nowhere", "-o", str(tmp_path / "out")])
-    assert run(monkeypatch, "save", tmp_path / "a") == 1
-    assert "FAILED: chain: track nowhere" in capsys.readouterr().out

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import grimp
 import pytest
 from importlinter.cli import lint_imports
 
@@ -20,13 +19,6 @@ def test_a_room_imports_only_from_above(monkeypatch: pytest.MonkeyPatch, capsys:
     monkeypatch.chdir(ROOT)
     code = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True, no_logo=True)
     assert code == 0, capsys.readouterr().out
-
-
-def test_lazy_imports_are_seen() -> None:
-    """Commands import writers only while they run."""
-    graph = grimp.build_graph("wepose_pin", cache_dir=None)
-    for name, page in {"calibrate": "calibration", "track": "pages"}.items():
-        assert graph.direct_import_exists(importer=f"wepose_pin.commands.{name}", imported=f"wepose_pin.report.{page}")
 
 
 def test_the_facade_knows_where_everything_is() -> None:

@@ -10,7 +10,7 @@ import sys
 import tomllib
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -246,31 +246,6 @@ def test_the_live_session_of_python_runs(workplace: Path, tmp_path: Path) -> Non
     assert (tmp_path / "morning.mcap").is_file()
 
 
-@pytest.mark.slow
-def test_what_is_left_out_of_the_pages_is_there() -> None:
-    lines = [command.words for page in RUN for command in commands(page)]
-    assert [pattern for pattern in ELSEWHERE if not any(re.search(pattern, line) for line in lines)] == []
-
-
-# The check of links --------------------------------------------------------------------------------------------------
-
-
-def test_links_of_the_site_are_checked(tmp_path: Path) -> None:
-    spec = spec_from_file_location("check_links", ROOT / "docs/check_links.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    other = '<h1 id="here">There</h1><a href="https://doi.org/10.1109/JSEN.2019.2940612">paper</a>'
-    (tmp_path / "other.html").write_text(other, encoding="utf-8")
-    page = tmp_path / "index.html"
-    page.write_text('<a href="other.html#here">a</a><a href="#top" id="top">b</a>', encoding="utf-8")
-    assert module.check(tmp_path) == []
-    for target in ("missing.html", "other.html#there", "#below", "https:/doi.org/x", "https://doi org/x"):
-        page.write_text(f'<a href="{target}">a</a>', encoding="utf-8")
-        assert len(module.check(tmp_path)) == 1, target
-
-
 # Packages ------------------------------------------------------------------------------------------------------------
 
 
@@ -299,31 +274,3 @@ def test_oldest_versions_are_those_of_the_package() -> None:
     assert conda == bounds
     assert f'version: "{project["version"]}"' in recipe
     assert f"- wepose = {project['scripts']['wepose']}\n" in recipe
-
-
-def test_one_function_says_how_to_install_and_knows_the_packages_of_the_extras() -> None:
-    """No release is on an index: a message names packages, and a page the extra of a clone."""
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    known = {re.split("[>;]", package)[0] for packages in extras.values() for package in packages}
-    for room in ("wepose_pin", "benchmarks", "docs", "examples"):
-        for file in (ROOT / room).rglob("*.*"):
-            if file.suffix not in (".py", ".md", ".ipynb", ".toml") or "_build" in file.parts:
-                continue
-            text = file.read_text(encoding="utf-8")
-            assert "wepose-pin[" not in text, file
-            if room == "wepose_pin" and file.name not in ("errors.py", "maps.py"):  # without their dependencies: robots
-                assert "pip install" not in text, file
-            for call in re.findall(r"how_to_install\(([^)]*)\)", text):
-                assert set(re.findall(r"[\w-]+", call)) <= known | {"package", "packages", "str"}, file
-            assert set(re.findall(r'import_library\("(\w+)', text)) <= known, file
-
-
-def test_every_step_of_the_workflows_is_a_target() -> None:
-    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    steps = [
-        step
-        for file in (ROOT / ".github/workflows").glob("*.yml")
-        for step in re.findall(r"^ +- run: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-    ]
-    assert len(steps) > 8
-    assert [step for step in steps if step != ".ci/run test-all" and step.split()[1] not in targets] == []
