@@ -6,13 +6,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
-from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, WeposeError
-from ..recording import ImuSensor, OrientationSensor, Recording, Sensor, format_span, format_time
+from ..recording import ImuSensor, OrientationSensor, Recording, format_span, format_time
 from ..recording.gaps import find_runs
 from ..recording.sensors import compute_rate
 from .noise import SensorNoise, estimate_noise
@@ -58,134 +56,142 @@ def find_reference_phases(recording: Recording, sways: bool = True) -> Reference
     WeposeError
         A phase with too few samples, with motion, or without gravity.
     """
-    start, static, diagnostics = _find_phases(recording)
-    noises: dict[str, SensorNoise] = {}
-    for segment, sensor in recording.sensors.items():
-        if not sensor.aligned:
-            diagnostics += check_motion(recording, segment, start, "start")
-            if static != start:
-                diagnostics += check_motion(recording, segment, static, "static")
-        if isinstance(sensor, ImuSensor):
-            rows = recording.find_measured(segment, static)
-            gyro_S, accel_S = sensor.gyro_S[rows], sensor.accel_S[rows]
-            try:
-                noises[segment] = estimate_noise(gyro_S, accel_S, recording.rate_hz, static == start and sways)
-            except WeposeError as error:
-                raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
-    diagnostics += check_common_rotation(recording, noises, static)
-    return ReferencePhases(start, static, noises, diagnostics)
-
-
-def _find_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
-    diagnostics = list(recording.diagnostics)
-    stated, static = recording.phases.get("start", ()), recording.phases.get("static", ())
-    is_guessed = not stated or recording.start_is_guessed
-    if static and not stated:
+    stated, lying = recording.phases.get("start", ()), recording.phases.get("static", ())
+    if lying and not stated:
         raise BadPhase(
             f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
             f"start = [[from, to]]"
         )
-    start = stated[0] if stated else find_static_window(recording)
-    for phase, intervals in (("start", stated), ("static", static)):
+    diagnostics = list(recording.diagnostics)
+    for phase, intervals in (("start", stated), ("static", lying)):
         if len(intervals) > 1:
             facts = {"start": intervals[0][0], "end": intervals[0][1]}
             diagnostics.append(Diagnostic("phase-intervals-ignored", WARNING, phase, facts=facts))
-    if is_guessed:
+    start = stated[0] if stated else find_static_window(recording)
+    _check_samples(recording, start, "start")
+    if not stated or recording.start_is_guessed:
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
-    for name, interval in (("start", start), *(("static", span) for span in static[:1])):
-        place = f"{recording.where()}: phases.{name}: [{format_time(interval[0])}, {format_time(interval[1])}]"
-        samples = len(recording.time[recording.span(interval)])
-        if samples < FEWEST_AT_START:
-            raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
-        for segment in recording.sensors:
-            measured = len(recording.find_measured(segment, interval))
-            if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
-                raise BadPhase(
-                    f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: its tilt "
-                    f"is not known; name seconds in which it measures, or take [sensors.{segment}] out"
+        place = "the guessed start pose"
+    else:
+        start, place = _find_static_part(recording, start, "start", diagnostics), "phases.start"
+    static = start
+    if lying:
+        _check_samples(recording, lying[0], "static")
+        static = _find_static_part(recording, lying[0], "static", diagnostics)
+    noises: dict[str, SensorNoise] = {}
+    for segment, sensor in recording.sensors.items():
+        if not sensor.aligned:
+            diagnostics += _check_motion(recording, segment, start, place)
+            diagnostics += _check_motion(recording, segment, static, "phases.static") if lying else []
+        if isinstance(sensor, ImuSensor):
+            measured = sensor.part(recording.find_measured(segment, static))
+            try:
+                noises[segment] = estimate_noise(
+                    measured.gyro_S, measured.accel_S, recording.rate_hz, static == start and sways
                 )
-    if not is_guessed:
-        start, moved = _find_static_part(recording, start, "start")
-        diagnostics += moved
-    if not static:
-        return start, start, diagnostics
-    lying, moved = _find_static_part(recording, static[0], "static")
-    return start, lying, [*diagnostics, *moved]
+            except WeposeError as error:
+                raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
+    diagnostics += _check_common_rotation(recording, noises, static)
+    return ReferencePhases(start, static, noises, diagnostics)
+
+
+def _check_samples(recording: Recording, interval: tuple[float, float], phase: str) -> None:
+    """Check that each sensor has measured in an interval [s]."""
+    place = f"{recording.where()}: phases.{phase}: [{format_time(interval[0])}, {format_time(interval[1])}]"
+    samples = len(recording.time[recording.span(interval)])
+    if samples < FEWEST_AT_START:
+        raise BadPhase(f"{place} holds {samples} samples; it needs at least {FEWEST_AT_START}, better two seconds")
+    for segment in recording.sensors:
+        measured = len(recording.find_measured(segment, interval))
+        if measured < max(FEWEST_AT_START, LEAST_SHARE_AT_START * samples):
+            raise BadPhase(
+                f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: its tilt "
+                f"is not known; name seconds in which it measures, or take [sensors.{segment}] out"
+            )
 
 
 def _find_static_part(
-    recording: Recording, interval: tuple[float, float], phase: str
-) -> tuple[tuple[float, float], list[Diagnostic]]:
-    """Find the longest part [s] of a stated interval in which no sensor moves, and the diagnostic that says so.
+    recording: Recording, interval: tuple[float, float], phase: str, diagnostics: list[Diagnostic]
+) -> tuple[float, float]:
+    """Find the longest part [s] of a stated interval in which no sensor moves, and add the diagnostic that says so.
 
     Raises
     ------
     BadPhase
         The interval has motion in it, and no part of `LEAST_STATIC_S` without.
     """
-    span, rate_hz = recording.span(interval), recording.rate_hz
-    size = max(1, round(BLOCK_S * rate_hz))
-    firsts = np.arange(span.start, span.stop, size)  # first sample of each block
-    rates_deg_s = {
-        segment: _compute_block_rates(sensor.part(span), rate_hz, size)
-        for segment, sensor in recording.sensors.items()
-        if not sensor.aligned
-    }
-    moves = np.any([rates > SWAYS_DEG_S for rates in rates_deg_s.values()], axis=0)
+    span = recording.span(interval)
+    size = span.stop - span.start
+    blocks = np.arange(0, size, max(1, round(BLOCK_S * recording.rate_hz)))
+    fastest, rate_deg_s, moves = "", 0.0, np.zeros(len(blocks), dtype=bool)
+    for segment, sensor in recording.sensors.items():
+        if sensor.aligned:
+            continue
+        part = sensor.part(span)
+        measured = np.ones(size) if part.gap is None else 1.0 - part.gap
+        counts = np.add.reduceat(measured, blocks)
+        rate = compute_rate(part, recording.rate_hz) * measured[:, None]
+        means = np.add.reduceat(rate, blocks) / np.maximum(1.0, counts)[:, None]
+        off = np.degrees(np.linalg.norm(means - np.median(means[counts > 0.0], axis=0), axis=1)) * (counts > 0.0)
+        moves |= off > SWAYS_DEG_S
+        if off.max() > rate_deg_s:
+            fastest, rate_deg_s = segment, float(off.max())
     if not moves.any():
-        return interval, []
+        return interval
     moves = np.convolve(moves, [1, 1, 1], mode="same") > 0  # motion begins and ends gently: a block more on both sides
     begin, end = max(find_runs(~moves), key=lambda run: run[1] - run[0], default=(0, 0))
-    stops = np.append(firsts[1:], span.stop)
-    static = (float(recording.time[firsts[begin]]), float(recording.time[stops[end - 1] - 1]))
-    fastest = max(rates_deg_s, key=lambda segment: float(np.max(rates_deg_s[segment])))
-    rate_deg_s = float(np.max(rates_deg_s[fastest]))
-    if begin == end or static[1] - static[0] < LEAST_STATIC_S:
+    rows = span.start + np.append(blocks, size)
+    static = (float(recording.time[rows[begin]]), float(recording.time[rows[end] - 1]))
+    if static[1] - static[0] < LEAST_STATIC_S:
         raise BadPhase(
             f"{recording.where()}: phases.{phase}: sensors.{fastest} turns at up to {rate_deg_s:.0f} deg/s in "
             f"{format_span(interval)}, and less than {LEAST_STATIC_S:g} s of it is static; name seconds in which "
             f"nothing moves, better four"
         )
-    facts: dict[str, float | str] = {
-        "phase": f"phases.{phase}",
-        "stated_start": interval[0],
-        "stated_end": interval[1],
-        "start": static[0],
-        "end": static[1],
-        "example": f"{phase} = [[{format_time(static[0])}, {format_time(static[1])}]]",
-    }
+    facts: dict[str, float | str] = {"phase": f"phases.{phase}", "start": static[0], "end": static[1]}
+    facts |= {"stated_start": interval[0], "stated_end": interval[1]}
+    facts["example"] = f"{phase} = [[{format_time(static[0])}, {format_time(static[1])}]]"
     value, limit = np.deg2rad([rate_deg_s, SWAYS_DEG_S]).tolist()
-    return static, [Diagnostic("static-phase-trimmed", WARNING, fastest, value, limit, facts)]
+    diagnostics.append(Diagnostic("static-phase-trimmed", WARNING, fastest, value, limit, facts))
+    return static
 
 
-def _compute_block_rates(sensor: Sensor, rate_hz: float, size: int) -> np.ndarray:
-    """Compute the mean rate (k,) [deg/s] of a sensor over blocks, without its bias; zero where it is lost."""
-    rate = compute_rate(sensor, rate_hz)
-    measured = np.ones(len(rate)) if sensor.gap is None else 1.0 - sensor.gap
-    blocks = np.arange(0, len(rate), size)
-    counts = np.add.reduceat(measured, blocks)
-    means = np.add.reduceat(rate * measured[:, None], blocks) / np.maximum(1.0, counts)[:, None]
-    off = means - np.median(means[counts > 0.0], axis=0)
-    return np.where(counts > 0.0, np.degrees(np.linalg.norm(off, axis=1)), 0.0)
+def _check_motion(recording: Recording, segment: str, interval: tuple[float, float], place: str) -> list[Diagnostic]:
+    """Check that a sensor is static in an interval [s]; sway gives a warning.
+
+    The rotation excludes the mean rate, in which the gyroscope's bias and a steady rotation cannot be separated.
+    """
+    sensor = recording.sensors[segment].part(recording.find_measured(segment, interval))
+    rate = np.degrees(compute_rate(sensor, recording.rate_hz))
+    rms = float(np.sqrt(np.mean(np.sum(rate**2, axis=1))))
+    bias = 0.0 if isinstance(sensor, OrientationSensor) else rate.mean(axis=0)
+    angle = np.cumsum(rate - bias, axis=0) / recording.rate_hz
+    turn = float(np.linalg.norm(angle - angle.mean(axis=0), axis=1).max())
+    if rms > MOVES_DEG_S or turn > MOVES_DEG:
+        raise BadPhase(
+            f"{recording.where()}: sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} "
+            f"({format_span(interval)}); name seconds in which it is static, up to {MOVES_DEG_S:g} deg/s and "
+            f"{MOVES_DEG:g} deg"
+        )
+    if rms <= SWAYS_DEG_S and turn <= SWAYS_DEG:
+        return []
+    value, limit, rotation, rotation_limit = np.deg2rad([rms, SWAYS_DEG_S, turn, SWAYS_DEG]).tolist()
+    facts: dict[str, float | str] = {"phase": place, "start": interval[0], "end": interval[1]}
+    facts |= {"rotation": rotation, "rotation_limit": rotation_limit}
+    return [Diagnostic("start-pose-motion", WARNING, segment, value, limit, facts)]
 
 
-def check_common_rotation(
+def _check_common_rotation(
     recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]
 ) -> list[Diagnostic]:
     """Check that the person does not rotate in a phase: the mean rate there is taken for the gyroscopes' biases.
 
     Biases about the vertical differ from sensor to sensor; a common rate is the person's (one-sample t-test). A slow
     rotation gives a warning and is added to the biases' covariance in `noises`.
-
-    Raises
-    ------
-    BadPhase
-        The person rotates by more than `MOVES_DEG`.
     """
     up_S = {}
     for segment in noises:
-        accel_S = recording.imus[segment].accel_S
-        mean_S = accel_S[recording.find_measured(segment, interval)].mean(axis=0)
+        mean_S = recording.imus[segment].accel_S[recording.find_measured(segment, interval)].mean(axis=0)
         up_S[segment] = mean_S / np.linalg.norm(mean_S)
     rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
     if len(rates) < FEWEST_SENSORS:
@@ -201,50 +207,10 @@ def check_common_rotation(
             f"name seconds in which the person does not turn"
         )
     for segment, noise in noises.items():
-        up = up_S[segment]
-        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
+        turning = mean**2 * np.outer(up_S[segment], up_S[segment])
+        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + turning)
     facts: dict[str, float | str] = {"variant": "rotates", "rotation": float(np.deg2rad(turn_deg))}
     return [Diagnostic("start-pose-motion", WARNING, value=abs(mean), limit=COMMON_RATE, facts=facts)]
-
-
-def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[Diagnostic]:
-    """Check that a sensor is static in a phase; sway gives a warning.
-
-    The rotation excludes the mean rate, in which the gyroscope's bias and a steady rotation cannot be separated.
-
-    Raises
-    ------
-    BadPhase
-        The sensor moves.
-    """
-    sensor, measured = recording.sensors[segment], recording.find_measured(segment, interval)
-    if isinstance(sensor, OrientationSensor):
-        R = Rotation.from_quat(sensor.quat_VS[measured])
-        rate = rotations.compute_turns(sensor.quat_VS[measured]) * recording.rate_hz
-    else:
-        rate = sensor.gyro_S[measured]
-        R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))
-    rms = float(np.degrees(np.sqrt(np.mean(np.sum(rate**2, axis=1)))))
-    turn = float(np.degrees(np.max((R.mean().inv() * R).magnitude())))
-    guessed = not recording.phases.get(phase) or (phase == "start" and recording.start_is_guessed)
-    place = "the guessed start pose" if guessed else f"phases.{phase}"
-    if rms > MOVES_DEG_S or turn > MOVES_DEG:
-        raise BadPhase(
-            f"{recording.where()}: sensors.{segment} turns by {turn:.0f} deg and at {rms:.0f} deg/s rms in {place} "
-            f"({format_span(interval)}); name seconds in which it is static, up to {MOVES_DEG_S:g} deg/s and "
-            f"{MOVES_DEG:g} deg"
-        )
-    if rms > SWAYS_DEG_S or turn > SWAYS_DEG:
-        facts: dict[str, float | str] = {
-            "rotation": float(np.deg2rad(turn)),
-            "rotation_limit": float(np.deg2rad(SWAYS_DEG)),
-            "phase": place,
-            "start": interval[0],
-            "end": interval[1],
-        }
-        limit = float(np.deg2rad(SWAYS_DEG_S))
-        return [Diagnostic("start-pose-motion", WARNING, segment, float(np.deg2rad(rms)), limit, facts)]
-    return []
 
 
 def find_static_window(recording: Recording) -> tuple[float, float]:

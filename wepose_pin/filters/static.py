@@ -21,11 +21,19 @@ from typing import Annotated
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
-from ..arguments import NonNegative, Positive, Range, check_fields, format_settings
+from ..arguments import NonNegative, Range, check_fields, format_settings
 from ..compilation import inlined, kernel
 from ..errors import BadOption
 from .base import as_rows, make_record
 from .noise import BLOCK_S, SensorNoise
+
+NEWEST_S = 0.05  # [s] of condition (6), about as long as the fastest smooth motion takes to begin
+# Of condition (5): about two periods of a standing person's sway, which cancels in the average; one standard deviation
+# by which the bias depends on how the sensor lies, twice what BROAD's sensors show at rest; drift of the bias, of which
+# three standard deviations are the warming of a strapped sensor by 5 to 10 K in a quarter of an hour.
+AVERAGING_S = 4.0  # [s]
+BIAS_SPREAD = float(np.deg2rad(0.01))  # [rad/s]
+BIAS_WALK = float(np.deg2rad(0.002))  # [rad/s/√s]
 
 # A sample is gyro [rad/s] (3), accel/g (3) and the norm of accel/g. Sums over samples are of these, of the products of
 # gyro and of accel (upper triangles xx xy xz yy yz zz), and of the squared norm, each of differences from an anchor.
@@ -49,12 +57,8 @@ class StaticTest:
     gamma1 : (3) the mean of ‖accel/g‖ differs from 1 by at most this
     gamma2 : (4) the variance of ‖accel/g‖ is at most this
     rate_stds : (5) the mean rate about the vertical differs from the known bias by at most so many standard deviations,
-        in the window and in an average over `averaging_s`. (6) the mean rate in the newest `newest_s` differs from that
-        of the window by no more, on an ellipsoid that is as probable as so many standard deviations of one axis
-    newest_s : [s] of (6), about as long as the fastest smooth motion takes to begin
-    averaging_s : [s] of (5), about two periods of a standing person's sway, which cancels in the average
-    bias_spread : [rad/s] of (5), one standard deviation by which the bias depends on how the sensor lies
-    bias_walk : [rad/s/√s] of (5), by which the bias drifts
+        in the window and in an average over 4 s. (6) the mean rate in the newest 0.05 s differs from that of the window
+        by no more, on an ellipsoid that is as probable as so many standard deviations of one axis
     """
 
     window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5
@@ -63,12 +67,6 @@ class StaticTest:
     gamma1: NonNegative = 0.01
     gamma2: NonNegative = 0.01
     rate_stds: float = 3.0
-    newest_s: Positive = 0.05
-    averaging_s: Positive = 4.0
-    bias_spread: NonNegative = float(np.deg2rad(0.01))  # twice what BROAD's sensors show at rest
-    # A strapped sensor warms by 5 to 10 K in a quarter of an hour, at 0.02 deg/s a kelvin that is 0.2 deg/s, here three
-    # standard deviations.
-    bias_walk: NonNegative = float(np.deg2rad(0.002))
 
     def __repr__(self) -> str:
         return format_settings(self)
@@ -102,9 +100,33 @@ class StaticDetector:
     """
 
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
-        self.test = test or USUAL_TEST
-        n = self.test.samples(rate_hz)
-        self._model = _build_model(noise, rate_hz, self.test)
+        test = test or USUAL_TEST
+        n, newest = test.samples(rate_hz), max(1, round(NEWEST_S * rate_hz))
+        dt, window_s = 1.0 / rate_hz, n / rate_hz
+        half_second_cov = np.zeros((3, 3)) if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
+        white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
+        # (6): the inverse covariance of the change over the square of its bound, χ² of three axes as probable as of one
+        squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
+        rate_change = np.zeros((3, 3))
+        if newest < n and 0.0 < squared_bound < np.inf:
+            change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
+            rate_change = np.linalg.inv(change_cov) / squared_bound
+        self._model = make_record(
+            inverse_gravity=1.0 / noise.gravity,  # [s²/m]
+            # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
+            limits=(n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
+            norm_variance=(n - 1) * test.gamma2,
+            norm_error=test.gamma1,
+            newest=np.int64(min(newest, n)),  # (6): samples of the newest part
+            rate_change=rate_change,  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
+            # condition (5)
+            squared_stds=test.rate_stds**2,
+            window_var=max(white, sway),  # [rad²/s²] of a window's mean
+            average_var=max(white, sway) * window_s / (2.0 * AVERAGING_S),  # [rad²/s²] of the average
+            spread_var=BIAS_SPREAD**2,  # [rad²/s²]
+            walk_var=BIAS_WALK**2 * dt,  # [rad²/s²] by which the known bias ages in a sample
+            fade=min(1.0, dt / AVERAGING_S),  # share of the average that a sample replaces
+        )
         # Arrays of their own, so that the compiled step is one for all rates of sampling
         self._block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
         self._tail = np.zeros((n, SUMS))  # sums of the block before, from each of its samples to its end
@@ -130,36 +152,6 @@ class StaticDetector:
     def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray) -> Callable[[], None]:
         """Return a call that fills `static` (n,) from the samples then in `gyro_S`, `accel_S` (n, 3), contiguous."""
         return partial(_run, self._state, self._model, self._block, self._tail, gyro_S, accel_S, static)
-
-
-def _build_model(noise: SensorNoise, rate_hz: float, test: StaticTest) -> np.ndarray:
-    """Build the constants of a detector, a record (1,)."""
-    n, newest = test.samples(rate_hz), max(1, round(test.newest_s * rate_hz))
-    dt, window_s = 1.0 / rate_hz, n / rate_hz
-    half_second_cov = np.zeros((3, 3)) if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
-    white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
-    # (6): the inverse covariance of the change, over the square of its bound, χ² of three axes as probable as of one
-    squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
-    rate_change = np.zeros((3, 3))
-    if newest < n and 0.0 < squared_bound < np.inf:
-        change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
-        rate_change = np.linalg.inv(change_cov) / squared_bound
-    return make_record(
-        inverse_gravity=1.0 / noise.gravity,  # [s²/m]
-        # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
-        limits=(n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
-        norm_variance=(n - 1) * test.gamma2,
-        norm_error=test.gamma1,
-        newest=np.int64(min(newest, n)),  # (6): samples of the newest part
-        rate_change=rate_change,  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
-        # condition (5)
-        squared_stds=test.rate_stds**2,
-        window_var=max(white, sway),  # [rad²/s²] of a window's mean
-        average_var=max(white, sway) * window_s / (2.0 * test.averaging_s),  # [rad²/s²] of the average
-        spread_var=test.bias_spread**2,  # [rad²/s²]
-        walk_var=test.bias_walk**2 * dt,  # [rad²/s²] by which the known bias ages in a sample
-        fade=min(1.0, dt / test.averaging_s),  # share of the average that a sample replaces
-    )
 
 
 @inlined
