@@ -46,11 +46,9 @@ def read_table(path: Path) -> pl.DataFrame:
         with library_errors(path, "a Parquet file"), path.open("rb") as file:  # of a path polars takes [ for a pattern
             return pl.read_parquet(file)
     layout = read_layout(path)
-    body = read_body(path, layout.head_lines)
-    names = [
-        f"{name}_duplicated_{layout.names[:k].count(name) - 1}" if name in layout.names[:k] else name
-        for k, name in enumerate(layout.names)
-    ]
+    body, names = read_body(path, layout.head_lines), layout.names
+    earlier = [names[:k].count(name) for k, name in enumerate(names)]
+    names = [f"{name}_duplicated_{n - 1}" if n else name for n, name in zip(earlier, names, strict=True)]
     table = parse_rows(path, body, names, layout.separator)
     filled = table.select(pl.any_horizontal(pl.all().is_not_null())).to_series().arg_true()
     table = table.head(int(filled[-1]) + 1 if len(filled) else 0)  # spreadsheets leave lines without values at the end
@@ -88,8 +86,6 @@ def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *,
         A row has more cells than there are names; the table is damaged.
     """
 
-    has_comments = b"#" in body  # to look for them takes a third longer
-
     def parse(texts: Collection[str], decimal_comma: bool = False, n_rows: int | None = None) -> pl.DataFrame:
         return pl.read_csv(
             body,
@@ -99,7 +95,7 @@ def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *,
             decimal_comma=decimal_comma,
             n_rows=n_rows,
             null_values=NO_VALUE,
-            comment_prefix="#" if has_comments else None,
+            comment_prefix="#" if b"#" in body else None,  # to look for comments takes a third longer
             encoding="utf8-lossy",
             raise_if_empty=False,
             missing_columns="insert",
@@ -152,22 +148,21 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
     if f"{name}_duplicated_0" in table.columns:
         raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
     series = table[name]
+    holds = f"{file}: column '{name}' holds"
     if series.dtype == pl.String:
         stripped = series.str.strip_chars()
         series = stripped.cast(pl.Float64, strict=False)
         bad = series.is_null() & stripped.is_not_null() & ~stripped.is_in(NO_VALUE)
         if bad.any():
-            row = int(bad.arg_max() or 0)
-            text = stripped[row]
+            text = stripped[row := int(bad.arg_max() or 0)]
             numeric = re.fullmatch(r"-?(\d+,\d*|,\d+)", text)
             right = f"write decimals with a point: {text.replace(',', '.')}" if numeric else "it must be a number"
-            raise BadData(f"{file}: column '{name}' holds text in row {row + 1}: '{text[:40]}'; {right}")
+            raise BadData(f"{holds} text in row {row + 1}: '{text[:40]}'; {right}")
     elif not series.dtype.is_numeric() and series.dtype != pl.Null:
-        raise BadData(f"{file}: column '{name}' holds values of type {series.dtype}; it must hold numbers")
+        raise BadData(f"{holds} values of type {series.dtype}; it must hold numbers")
     numbers = series.cast(pl.Float64)
     if numbers.is_infinite().any():
-        row = int(numbers.is_infinite().arg_max() or 0)
-        raise BadData(f"{file}: column '{name}' holds inf in row {row + 1}; it must be a number")
+        raise BadData(f"{holds} inf in row {int(numbers.is_infinite().arg_max() or 0) + 1}; it must be a number")
     return numbers.fill_null(float("nan")).rename(name)
 
 
@@ -218,22 +213,18 @@ def read_layout(path: Path) -> CsvLayout:
     if b"\0" in lines[0][1]:
         raise BadData(f"{path}: is not a CSV in UTF-8: there are zero bytes in its first line; save it as UTF-8")
     try:
-        text = [(k, line.decode("utf-8-sig").rstrip("\r\n")) for k, line in lines]
+        text = [(k, line.decode("utf-8-sig")) for k, line in lines]
     except UnicodeDecodeError:  # as spreadsheets of Windows write it
-        text = [(k, line.decode("cp1252", errors="replace").rstrip("\r\n")) for k, line in lines]
-    stated = re.fullmatch(r'"?sep=(.|\\t)"?[;,\t]*', text[0][1])  # a hint for spreadsheets
-    text = text[1:] if stated and len(text) > 1 else text
+        text = [(k, line.decode("cp1252", errors="replace")) for k, line in lines]
     # Semicolons or tabs where most lines have them, else commas.
     separator = next((sign for sign in ";\t" if 2 * sum(sign in line for _, line in text) > len(text)), ",")
-    separator = stated[1].replace("\\t", "\t") if stated else separator
     with library_errors(path, "a CSV"):
-        rows = [(k, next(csv.reader([line], delimiter=separator), [])) for k, line in text]
-    (first, last), units = _find_names([cells for _, cells in rows])
-    names = _join_names([cells for _, cells in rows[first:last]])
-    return CsvLayout(names, units, separator, rows[last if units else last - 1][0] + 1)
+        rows = [next(csv.reader([line.rstrip("\r\n")], delimiter=separator), []) for _, line in text]
+    first, last, units = _find_names(rows)
+    return CsvLayout(_join_names(rows[first:last]), units, separator, text[last if units else last - 1][0] + 1)
 
 
-def _find_names(rows: Sequence[Sequence[str]]) -> tuple[tuple[int, int], list[str]]:
+def _find_names(rows: Sequence[list[str]]) -> tuple[int, int, list[str]]:
     """Find the lines of names, from and to, and the cells of the line of units after them."""
     filled = [[cell.strip() for cell in cells if cell.strip()] for cells in rows]
 
@@ -242,24 +233,24 @@ def _find_names(rows: Sequence[Sequence[str]]) -> tuple[tuple[int, int], list[st
 
     numeric = next((k for k in range(1, len(rows)) if len(filled[k]) > 1 and share(k, _NUMBER) > 0.5), None)
     if numeric is None:
-        return (0, 1), []
+        return 0, 1, []
     width = len(rows[numeric])
-    units = numeric > 1 and len(rows[numeric - 1]) == width and share(numeric - 1, _UNITS) >= 0.5
-    last = numeric - 1 if units else numeric
+    has_units = numeric > 1 and len(rows[numeric - 1]) == width and share(numeric - 1, _UNITS) >= 0.5
+    last = numeric - 1 if has_units else numeric
     first = last - 1
     if first and len(rows[first]) == width == len(rows[first - 1]) and len(set(filled[first])) < len(filled[first]):
         first -= 1  # names in two lines: sensors above, their axes below
-    elif first and not units and len(rows[0]) == width <= 2 * len(filled[0]):
-        return (0, 1), []  # text in the first rows
-    return (first, last), list(rows[numeric - 1]) if units else []
+    elif first and not has_units and len(rows[0]) == width <= 2 * len(filled[0]):
+        return 0, 1, []  # text in the first rows
+    return first, last, rows[numeric - 1] if has_units else []
 
 
-def _join_names(lines: Sequence[Sequence[str]]) -> list[str]:
+def _join_names(lines: Sequence[list[str]]) -> list[str]:
     """Join the names of two lines, the upper one of which may name a sensor in the first of its columns alone."""
     if len(lines) == 1:
-        return list(lines[0])
-    upper, owners = "", []
-    for cell in lines[0]:
-        upper = cell.strip() or upper
-        owners.append(upper)
-    return [f"{owner} {name.strip()}".strip() for owner, name in zip(owners, lines[1], strict=True)]
+        return lines[0]
+    upper, names = "", []
+    for owner, name in zip(*lines, strict=True):
+        upper = owner.strip() or upper
+        names.append(f"{upper} {name.strip()}".strip())
+    return names
