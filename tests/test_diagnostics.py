@@ -151,5 +151,5 @@ def test_alike_are_told_together_the_gravest_first() -> None:
     assert titles[2] == "Live heading resets not repeated"
     assert texts[0][0] == WARNING
     assert texts[0][1].what.count("lost") == 3
-    assert texts[0][1].what.endswith("So it is in 2 more: d, e.")
+    assert texts[0][1].what.endswith("The same holds for d, e.")
     assert texts[0][1].line(titled=True).startswith("**Samples lost.** The a sensor lost 2 % of its samples")

@@ -29,8 +29,6 @@ class Severity(StrEnum):
 
 
 INFO, WARNING, ERROR = Severity.INFO, Severity.WARNING, Severity.ERROR
-_GRAVEST_FIRST = (ERROR, WARNING, INFO)
-_SAVED = ("code", "severity", "place", "value", "limit", "facts")  # keys of a file
 MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are shown in full
 
 
@@ -66,7 +64,7 @@ class Text(NamedTuple):
 
 
 def render(diagnostic: Diagnostic) -> Text:
-    """The diagnostic in words.
+    """Put the diagnostic in words.
 
     Raises
     ------
@@ -83,7 +81,7 @@ def render(diagnostic: Diagnostic) -> Text:
 def render_all(
     diagnostics: Iterable[Diagnostic], remedies: Mapping[str, str] = MappingProxyType({})
 ) -> list[tuple[Severity, Text]]:
-    """The diagnostics in words, the gravest first; those with the same reason and remedy are one text.
+    """Put diagnostics in words, the gravest first; those with the same reason and remedy are one text.
 
     `remedies` : code → what to do, in place of the catalogue's
     """
@@ -97,7 +95,7 @@ def render_all(
     for (_, severity, text), places in alike.items():
         shown, others = list(places)[:MOST_ALIKE], list(places.values())[MOST_ALIKE:]
         if others:
-            shown.append(f"So it is in {len(others)} more: {', '.join(dict.fromkeys(others)).replace('_', ' ')}.")
+            shown.append(f"The same holds for {', '.join(dict.fromkeys(others)).replace('_', ' ')}.")
         texts.append((severity, text._replace(what=" ".join(shown))))
     return texts
 
@@ -108,46 +106,44 @@ def lines(diagnostics: Iterable[Diagnostic], titled: bool = False) -> list[tuple
 
 
 def notebook_html(value: object, diagnostics: Iterable[Diagnostic] = (), tables: Iterable[str] = ()) -> str:
-    """What a notebook shows of an object: its one line, tables as HTML, and diagnostics in words."""
+    """Return what a notebook shows of an object: its one line, tables as HTML, and diagnostics in words."""
     entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(diagnostics))
     return f"<p>{escape(repr(value))}</p>{''.join(tables)}" + (f"<ul>{entries}</ul>" if entries else "")
 
 
 def gravest_first(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """Errors, then warnings, then the rest, each in the order in which they came."""
-    return sorted(diagnostics, key=lambda diagnostic: _GRAVEST_FIRST.index(diagnostic.severity))
+    """Sort errors, then warnings, then the rest, each in the order in which they came."""
+    return sorted(diagnostics, key=lambda diagnostic: (ERROR, WARNING, INFO).index(diagnostic.severity))
 
 
 def merge(diagnostics: Sequence[Diagnostic], others: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
-    """`diagnostics`, then those of `others` whose code and place are not among them: two rooms may find the same."""
+    """Append those of `others` whose code and place are not among the first: two rooms may find the same."""
     known = {(diagnostic.code, diagnostic.place) for diagnostic in diagnostics}
     return (*diagnostics, *(each for each in others if (each.code, each.place) not in known))
 
 
 def drop_consequences(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """The diagnostics without those that follow from another of them, as a tilted segment from a moved start pose."""
+    """Leave out what follows from another diagnostic, as a tilted segment from a moved start pose."""
     diagnostics = list(diagnostics)
     codes = {diagnostic.code for diagnostic in diagnostics}
     return [each for each in diagnostics if codes.isdisjoint(catalogue()[each.code].get("follows", ()))]
 
 
 def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
-    """The diagnostic with its text, for a JSON file; numbers that are not finite become null."""
+    """Return the diagnostic with its text, for a JSON file; numbers that are not finite become null."""
 
     def convert(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: convert(fact) for name, fact in value.items()}
-        if value is None or isinstance(value, str):
-            return value
-        return float(value) if math.isfinite(value) else None
+        return value if value is None or isinstance(value, str) else float(value) if math.isfinite(value) else None
 
-    return {name: convert(getattr(diagnostic, name)) for name in _SAVED} | {"text": render(diagnostic)._asdict()}
+    facts = {name: convert(fact) for name, fact in diagnostic.facts.items()}
+    own = {name: convert(getattr(diagnostic, name)) for name in ("code", "severity", "place", "value", "limit")}
+    return own | {"facts": facts, "text": render(diagnostic)._asdict()}
 
 
 def from_json(content: Mapping[str, Any]) -> Diagnostic:
-    """The diagnostic of `as_json`; its text is not read."""
-    code, severity, place, value, limit, facts = (content[name] for name in _SAVED)
-    return Diagnostic(code, Severity(severity), place, value, limit, dict(facts))
+    """Return the diagnostic of `as_json`; its text is not read."""
+    place, value, limit, facts = (content[name] for name in ("place", "value", "limit", "facts"))
+    return Diagnostic(content["code"], Severity(content["severity"]), place, value, limit, facts)
 
 
 # Numbers --------------------------------------------------------------------------------------------------------------
@@ -174,14 +170,13 @@ _UNITS = {
 
 
 def quantity(value: float | None, unit: str) -> str:
-    """A number in SI as a user reads it: ``quantity(0.5, "deg")`` is "29°". ``+`` before the unit: with its sign."""
-    sign, unit = ("+", unit[1:]) if unit.startswith("+") else ("", unit)
-    factor, name, digits = _UNITS[unit]
+    """Write a number in SI as a user reads it: ``quantity(0.5, "deg")`` is "29°"; of ``+deg`` with its sign."""
+    factor, name, digits = _UNITS[unit.removeprefix("+")]
     if value is None or not math.isfinite(value):
         return "not known"
     shown = factor * value
     decimals = 3 if unit == "time" else max(0, min(6, digits - 1 - math.floor(math.log10(abs(shown))))) if shown else 0
-    text = f"{shown:{sign}.{decimals}f}"
+    text = f"{shown:{'+' * unit.startswith('+')}.{decimals}f}"
     return (text.rstrip("0").rstrip(".") if "." in text else text) + name
 
 
@@ -200,11 +195,8 @@ def _fill(template: str, known: Mapping[str, Any]) -> str:
     return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
 
 
-# The catalogue --------------------------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Mapping[str, Any]]:
-    """Code → its table in diagnostics.toml."""
+    """Return code → its table in diagnostics.toml."""
     groups = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
     return {code: table for codes in groups.values() for code, table in codes.items()}

@@ -82,25 +82,6 @@ def turn_about(axes: str, angles: np.ndarray) -> Rotation:
     return Rotation.from_quat(reduce(multiply, turns))
 
 
-def quat_from_matrix(R: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) xyzw of rotation matrices (n, 3, 3): the largest component comes from its own square root."""
-    xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
-    squares = np.stack((1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz, 1.0 + xx + yy + zz), axis=1)
-    x, y, z = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
-    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
-    # Row k of the outer product 4 q qᵀ, for the largest component k.
-    rows = np.array(
-        (
-            (squares[:, 0], xy, xz, x),
-            (xy, squares[:, 1], yz, y),
-            (xz, yz, squares[:, 2], z),
-            (x, y, z, squares[:, 3]),
-        )
-    )
-    largest = rows[np.argmax(squares, axis=1), :, np.arange(len(R))]
-    return np.asarray(largest / np.linalg.norm(largest, axis=1, keepdims=True))
-
-
 def quat_from_gravity(accel_S: ArrayLike) -> np.ndarray:
     """Orientation `quat_VS` (4,) of a static sensor with zero heading: the shortest rotation of accel onto +z of V.
 

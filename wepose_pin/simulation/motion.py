@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption, one_of
-from ..rotations import compose, log, quat_from_matrix, turn_about
+from ..rotations import compose, log, turn_about
 from .imperfections import IDEAL_PRESET, Imperfections
 from .people import SIDES, Flaws, Offset, place_shoulder
 from .signals import Wander, integrate_pulse, make_pulse, make_step
@@ -290,7 +290,7 @@ class Motion(BodyMotion):
         m = np.cos(swivel)[:, None] * down + SIDES[side] * np.sin(swivel)[:, None] * np.cross(n, down)
         u = cos_alpha[:, None] * n + sin_alpha[:, None] * m  # shoulder to elbow
         x = sin_alpha[:, None] * n - cos_alpha[:, None] * m  # into which the forearm flexes
-        return Rotation.from_quat(quat_from_matrix(np.stack((x, np.cross(n, m), -u), axis=2))), flexion
+        return Rotation.from_matrix(np.stack((x, np.cross(n, m), -u), axis=2)), flexion
 
     def _reach(self, t: np.ndarray, side: str, hand: _Hand, hang: Rotation) -> tuple[np.ndarray, Rotation, np.ndarray]:
         """Shoulder (n, 3) [m] in T, upper arm in T and elbow flexion (n,) [rad] that bring the palm to its aim.
