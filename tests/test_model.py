@@ -154,9 +154,7 @@ def test_every_point_is_an_affine_function_of_the_lengths(urdf: Path) -> None:
     R_WK |= {s: data.oMf[m.getFrameId(s)].rotation for s in body.table.segments}
     lengths = np.array(list(body.lengths.values()))
     for point, parts in body.reaches.items():
-        place = np.sum(
-            [R_WK[link] @ (part.by_length @ lengths + part.constant) for link, part in parts.items()], axis=0
-        )
+        place = np.sum([R_WK[link] @ (B @ lengths + c) for link, (B, c) in parts.items()], axis=0)
         expected = data.oMf[m.getFrameId(body.point_frames[point])].translation
         np.testing.assert_allclose(place, expected, atol=1e-12)
 

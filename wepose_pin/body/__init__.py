@@ -5,23 +5,17 @@ joints with intersecting orthogonal axes and massless links between them. They a
 `pin.JointModelSpherical`, whose frame at zero is that of the link it moves; a `floating` joint likewise, since W does
 not travel. Other joints stay as they are.
 
-What there is on a body stands in a table beside its URDF (`BodyTable`): segments, points, lengths, hinges, poses,
-pairs. In a `BodyModel` links bear the names of segments and points, in our frames; a body of others gets massless links
-for them, fixed to its own.
-
-`table` is what stands on a body, and its file; `tree` the joints and the links by the table's names; `lengths` measures
-and stretches and has the way from the root to each point; `body` is what they make. A person's numbers stand in
-`subject`, those of all people in `anthropometry`, `mounts` finds how sensors are mounted from the start pose.
-
-`configuration` solves for the joints from orientations of segments, `links` places links and points and says how well
-they are known, `kinematics` does both (`Pose`).
+`table` is what stands on a body, and its file; `tree` the joints, and links by the table's names, in our frames;
+`lengths` measures and stretches, and has the way from the root to each point; `body` is what they make (`BodyModel`).
+A person's numbers stand in `subject`, those of all people in `anthropometry`; `mounts` finds how sensors are mounted
+from the start pose. `configuration` solves for the joints from orientations of segments, `links` places links and
+points and says how well they are known, `kinematics` does both (`Pose`).
 """
 
 from .anthropometry import SEXES, convert_breadths, list_breadths
 from .body import BodyModel, load_model
 from .girdle import Girdle
-from .lengths import LinkVector
-from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, load_table
+from .table import DEFAULT_BODY, ROOT, BodyTable, Limb, load_table
 from .urdf import Visual
 
 __all__ = [
@@ -31,9 +25,7 @@ __all__ = [
     "BodyModel",
     "BodyTable",
     "Girdle",
-    "HingeJoint",
     "Limb",
-    "LinkVector",
     "Visual",
     "convert_breadths",
     "list_breadths",

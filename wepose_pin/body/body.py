@@ -19,10 +19,10 @@ from ..errors import BadModel, BadSession, one_of
 from . import lengths as _lengths
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
-from .lengths import LinkVector, measure_reaches
+from .lengths import measure_reaches
 from .soft_tissue import TissueMean
 from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, read_table
-from .tree import MOST_LINKS, build, check_joint_values, parse_tree, rename_links
+from .tree import MOST_LINKS, Tree, build, check_joint_values, parse_tree, rename_links
 from .urdf import Visual, import_yourdfpy, list_visuals, read_urdf
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
@@ -101,8 +101,8 @@ class BodyModel:
         return {name: self.chains[name].above for name in self.table.segments if name in self.chains}
 
     @cached_property
-    def reaches(self) -> dict[str, dict[str, LinkVector]]:
-        """Point → link → its part of the way from the root, the same for all lengths."""
+    def reaches(self) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+        """Point → link → its part of the way from the root, the same for all lengths (`measure_reaches`)."""
         return measure_reaches(self.robot, self.table, self.pin, self.neutral_rotations)
 
     @cached_property
@@ -127,10 +127,10 @@ class BodyModel:
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Implausible lengths."""
         people, diagnostics = compute_population_lengths(self.table), []
-        margin = FAR_OFF * np.sqrt(np.diag(people.covariance))
-        for name, low, high in zip(people.names, people.mean - margin, people.mean + margin, strict=True):
+        for name, mean, std in zip(people.names, people.mean, np.sqrt(np.diag(people.covariance)), strict=True):
+            low, high = max(0.0, mean - FAR_OFF * std), mean + FAR_OFF * std
             if not low <= self.lengths[name] <= high:
-                limits = {"model": self.robot.name, "deviations": FAR_OFF, "shortest": max(0.0, low), "longest": high}
+                limits = {"model": self.robot.name, "deviations": FAR_OFF, "shortest": low, "longest": high}
                 diagnostics.append(Diagnostic("model-implausible", WARNING, name, self.lengths[name], facts=limits))
         return tuple(diagnostics)
 
@@ -164,14 +164,9 @@ class BodyModel:
         from lxml import etree
 
         library = import_yourdfpy()
-        urdf = library.URDF(
-            self.robot,
-            build_scene_graph=False,
-            load_meshes=False,
-            filename_handler=library.urdf.filename_handler_null,  # paths stay: `read_urdf` has resolved them
-        )
-        tree = urdf.write_xml()
-        return etree.tostring(tree, pretty_print=True, xml_declaration=True, encoding="utf-8").decode()
+        as_it_is = library.urdf.filename_handler_null  # of meshes, whose paths `read_urdf` has resolved
+        urdf = library.URDF(self.robot, build_scene_graph=False, load_meshes=False, filename_handler=as_it_is)
+        return etree.tostring(urdf.write_xml(), pretty_print=True, xml_declaration=True, encoding="utf-8").decode()
 
 
 def _find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
@@ -232,10 +227,29 @@ def load_model(path: str | Path | None = None, lengths: Mapping[str, float] | No
     0.26
     """
     check_arguments(load_model, locals())
-    path = _find_body(path)
-    packaged = path.parent == asset("urdf", f"{DEFAULT_BODY}.urdf").parent
-    body = _load_packaged_body(path) if packaged else _load_body(path)
+    body = _load(path)
     return body.with_lengths(lengths) if lengths else body
+
+
+def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: str) -> BodyModel:
+    """Read the body of a recording whose sensors have these names; of a URDF without a table a mechanism.
+
+    Its segments are the links that bear the sensors, as they are. Parameters and errors else as of `load_model`.
+
+    Raises
+    ------
+    BadSession
+        A sensor whose name is no link of a URDF without a table; `where` begins the text.
+    """
+    return _load(path, sensors, where)
+
+
+def _load(path: str | Path | None, sensors: Collection[str] = (), where: str = "") -> BodyModel:
+    default = asset("urdf", f"{DEFAULT_BODY}.urdf")
+    file = default if path is None else Path(path)
+    if not (file.suffix or file.exists() or len(file.parts) > 1):  # the name of a body of the package
+        file = asset("urdf", f"{load_table(file.name).name}.toml")
+    return _load_packaged_body(file) if file.parent == default.parent else _load_body(file, sensors, where)
 
 
 @lru_cache
@@ -244,22 +258,24 @@ def _load_packaged_body(path: Path) -> BodyModel:
     return _load_body(path)
 
 
-def _load_body(path: Path) -> BodyModel:
-    """Return the body of a URDF or of a table that names one."""
-    table = read_table(path) if path.suffix.lower() == ".toml" else None
-    urdf = path if table is None else path.parent / table.urdf
+def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> BodyModel:
+    """Return the body of a URDF or of a table that names one; a mechanism of the links with sensors where none does."""
+    own_table = read_table(path) if path.suffix.lower() == ".toml" else None
+    urdf = path if own_table is None else path.parent / own_table.urdf
     robot = read_urdf(urdf)
-    links = parse_tree(robot, str(urdf)).below
-    if table is not None:
-        for pose, values in table.poses.items():
-            check_joint_values(robot, values, f"{table.where}: poses.{pose}", BadModel)
-    by_table, table = table is not None, table or find_table(urdf, links)
+    tree = parse_tree(robot, str(urdf))
+    if own_table is not None:
+        for pose, values in own_table.poses.items():
+            check_joint_values(robot, values, f"{own_table.where}: poses.{pose}", BadModel)
+    table = own_table or find_table(urdf, tree.below)
+    if table is None and sensors:
+        return _build_mechanism(robot, tree, sensors, str(urdf), where)
     if table is None:
         default = load_table()
-        lacking = [name for name in default.needed if default.segments[name].link not in links]
+        lacking = [name for name in default.needed if default.segments[name].link not in tree.below]
         raise BadModel(
             f"{urdf}: no link {', '.join(map(repr, lacking))}; name the segments' links in a table, as docs/models.md "
-            f'shows (of a robot with kind = "mechanism"); {one_of(links, most=MOST_LINKS)}'
+            f'shows (of a robot with kind = "mechanism"); {one_of(tree.below, most=MOST_LINKS)}'
         )
     # Of a table for several URDFs the names of links fit; joints may have others.
     joints = {joint.name for joint in robot.joints}
@@ -276,48 +292,22 @@ def _load_body(path: Path) -> BodyModel:
     for name, hinge in body.table.hinges.items():
         if body.parents[hinge.moves] != hinge.on:
             raise BadModel(f"{table.where}: hinges.{name} is none: {hinge.moves} does not hang on {hinge.on}")
-    if by_table:  # an error where the table does not give its lengths
+    if own_table is not None:  # an error where the table does not give its lengths
         _lengths.with_lengths(body.robot, body.table, {name: 1.1 * value for name, value in body.lengths.items()})
     return body
 
 
-def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: str) -> BodyModel:
-    """Read the body of a recording whose sensors have these names; of a URDF without a table a mechanism.
-
-    Its segments are the links that bear the sensors, as they are. Parameters and errors else as of `load_model`.
-
-    Raises
-    ------
-    BadSession
-        A sensor whose name is no link of a URDF without a table; `where` begins the text.
-    """
-    file = _find_body(path)
-    if path is None or file.suffix.lower() == ".toml":
-        return load_model(path)
-    robot = read_urdf(file)
-    tree = parse_tree(robot, str(file))
-    if find_table(file, tree.below) is not None:
-        return load_model(path)
+def _build_mechanism(robot: Any, tree: Tree, sensors: Collection[str], urdf: str, where: str) -> BodyModel:
     for name in sensors:
         if name not in tree.below:
             choices = one_of(tree.below, name, MOST_LINKS)
             raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
     links = sorted(sensors, key=lambda name: len(tree.path(name)))
     segments = {name: Segment.of_mechanism(name, rigid=True) for name in links}
-    body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
+    body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=urdf), urdf)
     if not body.pin.nv:
-        raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")
+        raise BadModel(f"{urdf}: no joint moves; a chain of revolute or prismatic joints is needed")
     return body
-
-
-def _find_body(path: str | Path | None) -> Path:
-    """Find the file of a body: ours by its name, else the path itself."""
-    if path is None:
-        return asset("urdf", f"{DEFAULT_BODY}.urdf")
-    path = Path(path)
-    if path.suffix or path.exists() or len(path.parts) > 1:
-        return path
-    return asset("urdf", f"{load_table(path.name).name}.toml")
 
 
 def _body(robot: Any, table: BodyTable, where: str) -> BodyModel:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -136,20 +136,13 @@ def _stretch_link(link: Any, S: np.ndarray) -> None:
         inertial.inertia = R.T @ (np.trace(second) * np.eye(3) - second) @ R
 
 
-class LinkVector(NamedTuple):
-    """A link's part of the way from the root to a point, in its frame [m]: ``by_length @ lengths + constant``."""
-
-    by_length: np.ndarray  # (3, k), lengths in the order of the table
-    constant: np.ndarray  # (3,) [m]
-
-
 def measure_reaches(
     robot: Any, table: BodyTable, model: pin.Model, neutral: Mapping[str, np.ndarray]
-) -> dict[str, dict[str, LinkVector]]:
-    """Measure point → link → its part of the way from the root.
+) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Measure point → link → its part of the way from the root, ``B @ lengths + c`` [m] in the link: B (3, k), c (3,).
 
     A link is a segment; what a joint between segments moves has the joint's name and frame, and what is rigid with the
-    root is `UNIVERSE`.
+    root is `UNIVERSE`. Lengths are in the order of the table.
 
     Parameters
     ----------
@@ -165,7 +158,7 @@ def measure_reaches(
     for segment, parts in _find_projections(tree, table).items():
         stretches |= dict.fromkeys(_find_stretched(tree, table, segment)[1], parts)
     follow = {joint for girdle in table.girdles.values() for joint in girdle.joints}
-    reaches: dict[str, dict[str, LinkVector]] = {}
+    reaches: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
     for point, place in table.points.items():
         sums: dict[str, np.ndarray] = {}  # (3, k + 1) [m] in the link: by each length's ratio, and what is left
         for joint in tree.path(place.link):
@@ -184,5 +177,5 @@ def measure_reaches(
             by_length = np.round(vectors[:, :-1] / list(own.values()), _DECIMALS) + 0.0  # no negative zeros
             constant = np.round(vectors[:, -1], _DECIMALS) + 0.0
             if by_length.any() or constant.any():
-                reaches[point][link] = LinkVector(by_length, constant)
+                reaches[point][link] = by_length, constant
     return reaches

@@ -127,7 +127,7 @@ def find_floor(model: BodyModel) -> float:
         return 0.0
     lengths = np.array(list(model.lengths.values()))
     ways = model.reaches.values()
-    heights = [sum(float(part.by_length[2] @ lengths + part.constant[2]) for part in way.values()) for way in ways]
+    heights = [sum(float(B[2] @ lengths + c[2]) for B, c in way.values()) for way in ways]
     lowest = min(heights, default=FLOOR_Z)
     return lowest if lowest < FEET_Z else FLOOR_Z
 
