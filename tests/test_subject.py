@@ -81,7 +81,7 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
     ("text", "says"),
     [
         ("format = 1", "as `wepose calibrate` writes one, has format = 2"),
-        ("format = 2\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number [m] from"),
+        ("format = 2\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a finite number [m] above 0"),
         ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
         ("format = 2\n[lengths]\ntrunk = 0.5", "lengths: shoulder_width, left_upper_arm"),
         ("format 1", "not valid TOML"),

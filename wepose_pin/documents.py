@@ -301,11 +301,11 @@ def _convert(value: Any, key: Key) -> Any:
 def format_record(record: Any) -> dict[str, Any]:
     """Return key → its value in TOML, for `format_toml`; None, false and what is empty are left out."""
     values: dict[str, Any] = {}
-    for name, (hint, key) in _find_keys(record.__class__).items():
+    for name, (_, key) in _find_keys(record.__class__).items():
         value = getattr(record, name)
         if isinstance(value, np.ndarray):
             values |= _format_value(key, value)
-        elif value or isinstance(value, float) or (isinstance(value, Mapping) and float in get_args(hint)):
+        elif value or isinstance(value, float):
             values[key.name] = _format_value(key, value)
     return values
 

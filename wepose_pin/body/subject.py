@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import NonNegative, check_arguments, check_fields, check_names, check_numbers
+from ..arguments import NonNegative, Range, check_arguments, check_fields, check_names, check_numbers
 from ..diagnostics import notebook_html
 from ..documents import (
     Key,
@@ -35,6 +35,7 @@ from .table import BodyTable, load_table
 # A row of a covariance, other than lengths.
 _ROW = re.compile(r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law")
 LONGEST = 3.0  # [m] of a plausible length
+BodyLength = Annotated[float, Range(0.0, closed=False, high=LONGEST, unit="m")]
 FORMAT = 2
 Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
@@ -100,7 +101,7 @@ class Subject:
     """
 
     name: str
-    lengths: Annotated[Mapping[str, float], Key("lengths", "m", 1e-4, LONGEST, digits=6)]
+    lengths: Annotated[Mapping[str, BodyLength], Key("lengths", "m", digits=6)]
     order: Annotated[tuple[str, ...], None]
     covariance: Annotated[np.ndarray, None]
     mounts: Annotated[Mapping[str, np.ndarray], _MOUNT] = field(default_factory=dict)
@@ -178,7 +179,6 @@ class Subject:
         arrays |= {f"start_pose_offset.{name}.tilt": (each.tilt, 2) for name, each in self.start_pose_offset.items()}
         arrays |= {f"girdles.{name}": (values, len(PARAMETERS)) for name, values in self.girdles.items()}
         try:
-            check_lengths(f"{where}lengths", self.lengths)
             named = [row for row in self.order if not _ROW.fullmatch(row)]
             check_names(f"{where}covariance.order", named, self.lengths)
             if len(set(self.order)) < len(self.order):
@@ -195,8 +195,8 @@ class Subject:
         """Raise `BadSubject` where `quality` is "fail"."""
         if self.quality == "fail":
             raise BadSubject(
-                f"subject '{self.name}': its calibration failed (quality = \"fail\"); calibrate again, or use it all "
-                f"the same by --accept-failed (in Python accept_failed=True)"
+                f"subject '{self.name}': its calibration failed (quality = \"fail\"); calibrate again, or use it "
+                f"with --accept-failed (in Python accept_failed=True)"
             )
 
     def check_body(self, table: BodyTable) -> None:
@@ -338,13 +338,6 @@ def compute_girdle_prior(table: BodyTable) -> np.ndarray:
     return np.asarray(correlation * np.outer(std, std))
 
 
-def check_lengths(place: str, lengths: Mapping[str, float]) -> None:
-    """Raise `BadOption` where a length [m] has an impossible value."""
-    for name, value in lengths.items():
-        if not 0.0 < value < LONGEST:
-            raise BadOption(f"{place}.{name} = {value:g}: a length in metres is needed, above 0 and below {LONGEST:g}")
-
-
 def population_subject(
     stature: float | None = None, sex: str | None = None, body: BodyModel | BodyTable | None = None
 ) -> Subject:
@@ -403,7 +396,7 @@ def population_subject(
 
 def subject_toml(subject: Subject) -> str:
     """Return the text of ``subject.toml``."""
-    values = {"format": str(FORMAT), **format_record(subject)}
+    values = {"format": str(FORMAT), "lengths": {}, **format_record(subject)}
     for segment in subject.mounts:
         if (cov := subject.mount_covariance(segment)) is not None:
             values["mounts"][segment]["std_deg"] = f"{np.degrees(np.sqrt(np.trace(cov) / 3.0)):.3f}"

@@ -14,7 +14,7 @@ from ..arguments import Count, Positive, check_arguments, check_names
 from ..body import DEFAULT_BODY, SEXES, load_table
 from ..body.girdle import PARAMETERS
 from ..body.kinematics import Pose
-from ..body.subject import Subject, check_lengths, population_subject
+from ..body.subject import BodyLength, Subject, population_subject
 from ..errors import BadOption
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
@@ -151,7 +151,7 @@ def _sample_poses(motion: BodyMotion, t: np.ndarray, segments: Sequence[str]) ->
 
 
 def simulate(
-    lengths: Mapping[str, float],
+    lengths: Mapping[str, BodyLength],
     *,
     seed: Count,
     rate_hz: Positive = 100.0,
@@ -207,7 +207,6 @@ def simulate(
     check_arguments(simulate, locals())
     names = tuple(load_table().lengths)
     check_names("lengths", lengths, names)
-    check_lengths("lengths", lengths)
     missing = [name for name in names if name not in lengths]
     if missing:
         raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
