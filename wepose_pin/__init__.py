@@ -73,54 +73,32 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .writers.result import load_result as load_result
 
 # Loaded on first use, so that the command line answers at once.
-_WHERE = {
-    "Angles": "angles",
-    "BadData": "errors",
-    "BadModel": "errors",
-    "BadOption": "errors",
-    "BadPhase": "errors",
-    "BadSession": "errors",
-    "BadSource": "errors",
-    "BadSubject": "errors",
-    "BodyModel": "body",
-    "Calibration": "calibration",
-    "Diagnostic": "diagnostics",
-    "ExistingOutput": "errors",
-    "IDEAL_PRESET": "simulation",
-    "Imperfections": "simulation",
-    "ImuNoise": "simulation",
-    "ImuSensor": "recording",
-    "MILD_PRESET": "simulation",
-    "MissingFile": "errors",
-    "NOISE_FREE": "simulation",
-    "NoSolution": "errors",
-    "OrientationSensor": "recording",
-    "PEOPLE_PRESET": "simulation",
-    "Person": "simulation",
-    "Pose": "body.kinematics",
-    "Recording": "recording",
-    "Simulation": "simulation",
-    "StaticTest": "filters.static",
-    "Subject": "body.subject",
-    "TrackResult": "tracking",
-    "WeposeError": "errors",
-    "WeposeWarning": "errors",
-    "calibrate": "calibration",
-    "estimate_orientation": "filters",
-    "evaluate": "evaluation",
-    "export": "writers.export",
-    "joint_angles": "angles",
-    "load_model": "body",
-    "load_result": "writers.result",
-    "load_session": "readers",
-    "load_subject": "body.subject",
-    "population_subject": "body.subject",
-    "retarget": "retargeting",
-    "simulate": "simulation",
-    "simulate_activity": "simulation",
-    "simulate_person": "simulation",
-    "track": "tracking",
+_ROOMS = {
+    "angles": "Angles joint_angles",
+    "body": "BodyModel load_model",
+    "body.kinematics": "Pose",
+    "body.subject": "Subject load_subject population_subject",
+    "calibration": "Calibration calibrate",
+    "diagnostics": "Diagnostic",
+    "errors": (
+        "BadData BadModel BadOption BadPhase BadSession BadSource BadSubject ExistingOutput MissingFile "
+        "NoSolution WeposeError WeposeWarning"
+    ),
+    "evaluation": "evaluate",
+    "filters": "estimate_orientation",
+    "filters.static": "StaticTest",
+    "readers": "load_session",
+    "recording": "ImuSensor OrientationSensor Recording",
+    "retargeting": "retarget",
+    "simulation": (
+        "IDEAL_PRESET Imperfections ImuNoise MILD_PRESET NOISE_FREE PEOPLE_PRESET Person Simulation "
+        "simulate simulate_activity simulate_person"
+    ),
+    "tracking": "TrackResult track",
+    "writers.export": "export",
+    "writers.result": "load_result",
 }
+_WHERE = {name: room for room, names in _ROOMS.items() for name in names.split()}
 # What the methods of `TrackResult` call in rooms above its own.
 _OF_RESULTS = {"draw_figures": "report.track", "show_result": "report.pages", "save_result": "report.pages"}
 __all__ = ["__version__", *sorted(_WHERE)]
