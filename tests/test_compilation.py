@@ -12,11 +12,6 @@ import numpy as np
 from wepose_pin import rotations
 print(rotations.up_in_sensor(np.array([0.0, 0.0, 0.0, 1.0])))
 """
-_FULL_DISK = """
-import resource, signal
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
-"""
 
 
 def _fresh(code: str, notices: int = 0, **environment: str) -> str:
@@ -34,7 +29,3 @@ def test_compiled_once_and_kept(tmp_path: Path) -> None:
     assert kept
     assert _fresh(announced, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")} == kept
-
-
-def test_a_full_disk_is_no_error(tmp_path: Path) -> None:
-    assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -48,18 +47,9 @@ def announce_compilation() -> None:
 
 def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
     try:
-        dispatcher = njit(cache=True, **options)(function)
+        return njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor a home is writable
         return njit(**options)(function)
-    if (cache := getattr(dispatcher, "_cache", None)) is not None:
-        save = cache.save_overload
-
-        def try_to_save(*args: Any) -> None:
-            with contextlib.suppress(OSError):  # with a full disk it compiles again the next time
-                save(*args)
-
-        cache.save_overload = try_to_save
-    return dispatcher
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
