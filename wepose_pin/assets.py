@@ -26,11 +26,6 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
     """Name → what distributions register as entry points ``wepose.GROUP``: "readers", "writers", "sources", "outputs".
 
     What this package brings is registered in the same way, in pyproject.toml. It stands first, and its names are taken.
-
-    Raises
-    ------
-    BadOption
-        This package's own are missing: it was not installed, or before it registered them.
     """
     found = sorted(entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin."))
     if not found or not found[0].value.startswith("wepose_pin."):
@@ -43,13 +38,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 @cache
 def load_plugin(group: str, name: str) -> Any:
-    """The object that is registered by this name.
-
-    Raises
-    ------
-    BadOption
-        Its distribution is broken: it cannot be imported.
-    """
+    """Load the object that is registered by this name; raise `BadOption` where it cannot be imported."""
     try:
         return find_plugins(group)[name].load()
     except (ImportError, AttributeError) as error:

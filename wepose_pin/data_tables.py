@@ -35,12 +35,7 @@ _UNITS = re.compile(
 def read_table(path: Path) -> pl.DataFrame:
     """Read the table in a file of `FORMATS`, all but ``.parquet`` as a CSV, whose lines with ``#`` are comments.
 
-    Raises
-    ------
-    MissingFile
-        The file is missing, a folder, or of another format.
-    BadData
-        The file is damaged, or has rows of different lengths.
+    Raise `MissingFile` where there is no such table, `BadData` where it is damaged or has rows of different lengths.
     """
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"), path.open("rb") as file:  # of a path polars takes [ for a pattern
@@ -78,12 +73,8 @@ def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
 def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *, lenient: bool = False) -> pl.DataFrame:
     """Parse the rows of a CSV: columns are numbers, or text where a cell is none; null without a value.
 
-    Decimals may have commas where these separate no columns. `lenient`: cells beyond the names are left out.
-
-    Raises
-    ------
-    BadData
-        A row has more cells than there are names; the table is damaged.
+    Decimals may have commas where these separate no columns. `lenient`: cells beyond the names are left out, else they
+    raise `BadData`, as a damaged table does.
     """
 
     def parse(texts: Collection[str], decimal_comma: bool = False, n_rows: int | None = None) -> pl.DataFrame:
@@ -129,14 +120,8 @@ def _find_ragged(path: Path, body: bytes, width: int, separator: str) -> None:
 def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str) -> np.ndarray:
     """Read columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
 
-    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text.
-
-    Raises
-    ------
-    UnknownColumn
-        A name is not in the table.
-    BadData
-        A column has other values than numbers, or its name occurs twice in the file.
+    Raise `UnknownColumn` where a name is not in the table, `BadData` where a column has other values than numbers, or
+    its name occurs twice; `file` and `place` (such as ``sensors.torso.gyro``) begin the text.
     """
     numbers = [_read_numbers(table, name, file, place) for name in names]
     return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
@@ -197,12 +182,8 @@ def read_layout(path: Path) -> CsvLayout:
     """Find the separator and the line of names of a CSV.
 
     The names are in the first line that is no comment. Where the first row of numbers has another number of cells,
-    they are in the line right above that row, or above a line of units.
-
-    Raises
-    ------
-    MissingFile, BadData
-        The file is not readable; empty; not text.
+    they are in the line right above that row, or above a line of units. Raise `BadData` where the file is empty or no
+    text.
     """
     with library_errors(path, "a CSV"), path.open("rb") as file:
         start = file.read(PREAMBLE_BYTES)

@@ -64,13 +64,7 @@ class Text(NamedTuple):
 
 
 def render(diagnostic: Diagnostic) -> Text:
-    """Put the diagnostic in words.
-
-    Raises
-    ------
-    KeyError
-        The catalogue has no such code, or the text needs a fact that is not there.
-    """
+    """Put the diagnostic in words; `KeyError`: the catalogue has no such code, or a fact of its text is missing."""
     template = catalogue()[diagnostic.code]
     for word in str(diagnostic.facts.get("variant", "")).split():
         template = {**template, **template.get("variants", {}).get(word, {})}

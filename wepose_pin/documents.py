@@ -31,12 +31,7 @@ R = TypeVar("R")
 def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> dict[str, Any]:
     """Read a TOML file; `what` names the expected contents in an error's text.
 
-    Raises
-    ------
-    MissingFile
-        The file is missing, or cannot be read.
-    WeposeError
-        It is not TOML; an error of the kind `error`.
+    Raise `MissingFile` where the file is missing or cannot be read, an `error` where it is not TOML.
     """
     if not path.is_file():
         state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
@@ -344,10 +339,7 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
     folder, ``.NAME.partial-…``, beside `out`, or in an existing `out`; it is never read and can be deleted. A new `out`
     appears at once with all its files; in an existing one they appear one by one, each complete.
 
-    Raises
-    ------
-    ExistingOutput
-        `out` is not empty and `force` is false, or it is no folder, or cannot be written.
+    Raise `ExistingOutput` where `out` is not empty and `force` is false, or it is no folder, or cannot be written.
     """
     prefix = f".{out.absolute().name}.partial-"
     _check_folder(out, force, prefix)
@@ -392,10 +384,7 @@ def _check_folder(out: Path, force: bool, prefix: str) -> None:
 def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
     """Create a path beside `file` to write to; it becomes `file` when the block succeeds, and is deleted otherwise.
 
-    Raises
-    ------
-    ExistingOutput
-        `file` exists and `force` is false, or it cannot be written.
+    Raise `ExistingOutput` where `file` exists and `force` is false, or it cannot be written.
     """
     check_file(file, force)
     partial = file.with_name(f".{file.name}.partial")

@@ -21,13 +21,7 @@ def check_file(path: Path, kind: str) -> None:
 
 
 def import_library(module: str, path: Path, kind: str) -> Any:
-    """Import a module of an optional package, which reads `path`; its `kind` is such as "a C3D".
-
-    Raises
-    ------
-    BadData
-        It is not installed.
-    """
+    """Import a module of an optional package, which reads `path`, a `kind` such as "a C3D"; else raise `BadData`."""
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -37,13 +31,7 @@ def import_library(module: str, path: Path, kind: str) -> Any:
 
 @contextmanager
 def library_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn what is raised on a file that cannot be read into one line; `kind` is such as "a C3D".
-
-    Raises
-    ------
-    BadData
-        A library, or the code of the block, raised an error of another kind than ours.
-    """
+    """Turn errors that are not ours, on a file that cannot be read, into one `BadData`; `kind` is such as "a C3D"."""
     try:
         with native_stderr_muted():  # polars prints its panics, which are no Exception
             yield

@@ -86,12 +86,7 @@ def quat_from_gravity(accel_S: ArrayLike) -> np.ndarray:
     """Orientation `quat_VS` (4,) of a static sensor with zero heading: the shortest rotation of accel onto +z of V.
 
     Zero heading means no twist about the vertical; that is defined for every mount but the one exactly upside down,
-    where the half turn about x is taken.
-
-    Raises
-    ------
-    ValueError
-        `accel_S` is zero.
+    where the half turn about x is taken. `ValueError`: `accel_S` is zero.
     """
     accel = np.asarray(accel_S, dtype=float)
     norm = np.linalg.norm(accel)

@@ -234,12 +234,8 @@ def load_model(path: str | Path | None = None, lengths: Mapping[str, float] | No
 def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: str) -> BodyModel:
     """Read the body of a recording whose sensors have these names; of a URDF without a table a mechanism.
 
-    Its segments are the links that bear the sensors, as they are. Parameters and errors else as of `load_model`.
-
-    Raises
-    ------
-    BadSession
-        A sensor whose name is no link of a URDF without a table; `where` begins the text.
+    Its segments are the links that bear the sensors, as they are; a sensor whose name is no link raises `BadSession`,
+    whose text begins with `where`. Parameters and errors else as of `load_model`.
     """
     return _load(path, sensors, where)
 

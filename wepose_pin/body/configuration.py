@@ -39,11 +39,6 @@ def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray], *, 
     ----------
     quat_WL : segment → (n, 4) xyzw; an unmeasured segment is rigid with the one above
     limits : keep the limits of joints with one axis; those of spherical joints are not kept
-
-    Raises
-    ------
-    BadData, BadModel
-        No segment; the model has no link for one.
     """
     solver = ConfigurationSolver(model, quat_WL, limits=limits)
     return solver.solve(np.stack(list(quat_WL.values()), axis=1))

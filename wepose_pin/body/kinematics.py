@@ -108,13 +108,7 @@ def find_usual_rate(time: np.ndarray) -> float:
 
 
 def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
-    """Return the samples of times (n,) [s] within an interval [s], both ends included.
-
-    Raises
-    ------
-    BadData
-        There is none.
-    """
+    """Return the samples of times (n,) [s] within an interval [s], both ends included; `BadData`: there is none."""
     first, last = (int(k) for k in np.searchsorted(time, [interval[0] - 1e-9, interval[1] + 1e-9]))
     if first == last:
         raise BadData(f"the interval {format_span(interval)} has no sample")
@@ -148,11 +142,8 @@ def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
 def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     """Parse a `Pose` from a table as of `build_pose_table`; segments and points may be missing.
 
-    Raises
-    ------
-    BadData
-        No column of time, or one that does not increase; neither orientations nor points; a text; a quaternion that is
-        not of unit norm.
+    Raise `BadData` where time is missing or does not increase, with neither orientations nor points, on a text, or on
+    a quaternion that is not of unit norm.
     """
     if "time" not in table.columns:
         raise BadData(f"{file}: no column 'time'; a table as in pose.parquet is needed; {one_of(table.columns)}")

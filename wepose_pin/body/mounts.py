@@ -96,12 +96,7 @@ def compute_start_configuration(
     ----------
     start_pose : a pose of the body's table, or "configuration"
     joints : joint of the URDF → value [rad or m] in a configuration; those not named are at zero
-    where : begins an error's text
-
-    Raises
-    ------
-    BadSession
-        A start pose that the table does not have; a joint that the body does not have, or outside its limits.
+    where : begins the text of a `BadSession`: an unknown start pose or joint, a joint outside its limits
     """
     poses = {**model.table.poses, CONFIGURATION: joints}
     if start_pose not in poses:
@@ -126,13 +121,7 @@ def compute_start_configuration(
 def collect_nominal_mounts(
     recording: Recording, subject: Subject | None, start_pose: StartPose
 ) -> dict[str, np.ndarray]:
-    """Return segment → nominal mount `quat_LS` (4,) xyzw of every sensor.
-
-    Raises
-    ------
-    BadSession
-        Neither the subject nor the session has the mount of a sensor.
-    """
+    """Return segment → nominal mount `quat_LS` (4,) xyzw of every sensor; raise `BadSession` where one is not known."""
     nominal = {segment: find_nominal_mount(recording, segment, subject, start_pose) for segment in recording.sensors}
     missing = [segment for segment, mount in nominal.items() if mount is None]
     if missing:
@@ -213,10 +202,7 @@ def align_sensors(
     R_VS_start, start : mean orientations of the sensors in the start pose, and its interval [s]
     start_pose : `find_start_pose` of the body; left out: the N-pose
 
-    Raises
-    ------
-    BadSession
-        No mount is known for a sensor, or gravity contradicts it.
+    Raise `BadSession` where no mount is known for a sensor, or gravity contradicts it.
     """
     diagnostics: list[Diagnostic] = []
     nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
