@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,23 +15,16 @@ from .table import BodyTable
 SEXES = ("f", "m")
 
 
-class LengthPrior(NamedTuple):
-    """Lengths before anything is measured: names, mean (k,) [m], covariance (k, k) [m²], and whose they are."""
-
-    names: tuple[str, ...]
-    mean: np.ndarray
-    covariance: np.ndarray
-    note: str
-
-
 def check_stature(stature: float | None) -> None:
     """Raise `BadOption` where a stature is not between 1.0 and 2.5 m."""
     if stature is not None and not 1.0 <= stature <= 2.5:
         raise BadOption(f"stature {stature:g} is not a body height in metres; between 1.0 and 2.5")
 
 
-def compute_population_lengths(table: BodyTable, stature: float | None = None, sex: str | None = None) -> LengthPrior:
-    """The lengths of a table that people have, which name a share of stature, for `stature` [m] and `sex`.
+def compute_population_lengths(
+    table: BodyTable, stature: float | None = None, sex: str | None = None
+) -> tuple[dict[str, float], np.ndarray, str]:
+    """Compute the lengths [m] that name a share of stature, their covariance (k, k) [m²], and whose they are.
 
     Lengths share the stature's spread where it is not given, left and right share the person's shape; numbers and
     sources stand in ``calibration/anthropometry.toml``.
@@ -42,24 +35,21 @@ def compute_population_lengths(table: BodyTable, stature: float | None = None, s
     numbers = _read_numbers()
     height = stature if stature is not None else numbers["stature"]["mean"]
     height_std = 0.0 if stature is not None else numbers["stature"]["std"] / numbers["stature"]["mean"]
-    shares = [numbers[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
+    of_sexes = [numbers[{"f": "female", "m": "male"}[s]] for s in ([sex] if sex else SEXES)]
 
-    names = [name for name, length in table.lengths.items() if length.share]
-    part = [table.lengths[name].share for name in names]
-    for name, share in zip(names, part, strict=True):
+    shares = {name: length.share for name, length in table.lengths.items() if length.share}
+    for name, share in shares.items():
         if share not in numbers["shape_std"]:
-            raise BadModel(
-                f"{table.where}: lengths.{name}.share = '{share}' is not known; {one_of(numbers['shape_std'], share)}"
-            )
-    mean = np.array([height * np.mean([share[p] for share in shares]) for p in part])
+            choices = one_of(numbers["shape_std"], share)
+            raise BadModel(f"{table.where}: lengths.{name}.share = '{share}' is not known; {choices}")
+    mean = np.array([height * np.mean([each[share] for each in of_sexes]) for share in shares.values()])
     # Relative errors: one of stature common to all, one of shape common to left and right, one of each side.
-    shape = np.array([numbers["shape_std"][p] for p in part])
-    same = np.array([[a == b for a in part] for b in part], dtype=float)
-    sided = np.array([bool(table.side(name)) for name in names], dtype=float)
+    shape = np.array([numbers["shape_std"][share] for share in shares.values()])
+    same = np.array([[a == b for a in shares.values()] for b in shares.values()], dtype=float)
+    sided = np.array([bool(table.side(name)) for name in shares], dtype=float)
     relative = height_std**2 + same * np.outer(shape, shape) + np.diag(sided * numbers["asymmetry_std"]["all"] ** 2)
-    known = ", ".join([f"stature {height:g} m" + ("" if stature else " assumed"), f"sex {sex or 'not given'}"])
-    covariance = np.outer(mean, mean) * relative
-    return LengthPrior(tuple(names), mean, covariance, f"population prior ({known})")
+    note = f"population prior (stature {height:g} m{'' if stature else ' assumed'}, sex {sex or 'not given'})"
+    return dict(zip(shares, mean.tolist(), strict=True)), np.outer(mean, mean) * relative, note
 
 
 def list_breadths(table: BodyTable) -> dict[str, tuple[str, float, float]]:

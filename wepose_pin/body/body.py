@@ -126,8 +126,9 @@ class BodyModel:
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Implausible lengths."""
-        people, diagnostics = compute_population_lengths(self.table), []
-        for name, mean, std in zip(people.names, people.mean, np.sqrt(np.diag(people.covariance)), strict=True):
+        people, covariance, _ = compute_population_lengths(self.table)
+        diagnostics = []
+        for (name, mean), std in zip(people.items(), np.sqrt(np.diag(covariance)), strict=True):
             low, high = max(0.0, mean - FAR_OFF * std), mean + FAR_OFF * std
             if not low <= self.lengths[name] <= high:
                 limits = {"model": self.robot.name, "deviations": FAR_OFF, "shortest": low, "longest": high}

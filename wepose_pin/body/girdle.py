@@ -26,6 +26,7 @@ from ..rotations import product
 MAX_ELEVATION = np.deg2rad(130.0)  # [rad] up to which the law holds; it stays there beyond
 # Of a person: a share of the law, then [m].
 PARAMETERS = ("law", "rest_x", "rest_y", "rest_z", "raised_x", "raised_y", "raised_z")
+FIXED = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # of shoulders that do not move on the trunk
 # s that stands for the limb's elevation where it has no sensor: arms at 50 ± 35° in mixed planes.
 MEAN_RAISED = 0.55
 _LEAST_SINE = 1e-9  # squared; keeps the slope finite at rest, where the law is below a micrometre

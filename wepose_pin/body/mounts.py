@@ -221,7 +221,14 @@ def align_sensors(
         R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS
         tilt_error = float((R_WS_start * R_WS_nominal.inv()).magnitude())
         if tilt_error > np.deg2rad(MAX_MOUNT_ERROR_DEG):
-            raise BadSession(_describe_mount_error(recording, segment, subject, np.degrees(tilt_error), start))
+            name, remedy = ".mount", "state which sensor axis points up and which forward"
+            if subject is not None and segment in subject.mounts and not recording.remounted:
+                name = ": its calibrated mount"
+                remedy = "if the sensor was mounted again, state remounted = true and its mount"
+            raise BadSession(
+                f"{recording.where()}: sensors.{segment}{name} is {np.degrees(tilt_error):.0f} deg off gravity in the "
+                f"start pose ({format_span(start)}); {remedy}, or the seconds of the start pose in [phases]"
+            )
         if tilt_error > np.deg2rad(MOUNT_WARNING_DEG):
             limit = float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit))
@@ -245,18 +252,3 @@ def align_sensors(
                 diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
         mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi
     return mounts, heading_offsets, diagnostics
-
-
-def _describe_mount_error(
-    recording: Recording, segment: str, subject: Subject | None, tilt_error_deg: float, start: tuple[float, float]
-) -> str:
-    if subject is not None and segment in subject.mounts and not recording.remounted:
-        name, remedy = ": its calibrated mount", "if the sensor was mounted again, state remounted = true and its mount"
-    else:
-        name, remedy = ".mount", "check which sensor axis points up and which forward"
-    if recording.start_is_guessed or not recording.phases.get("start"):
-        remedy = f"the interval was only guessed: state [phases] start = [[from, to]], or {remedy}"
-    return (
-        f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start pose "
-        f"({format_span(start)}); {remedy}"
-    )

@@ -71,8 +71,7 @@ class SoftTissueCorrection:
         names = [name for name in table.segments if name in columns and name in means]
         tissues = [table.segments[name].soft_tissue for name in names]
         share = np.array([means[name].share for name in names])[:, None]
-        raised = np.array([[segment in tissue.raised for segment in segments] for tissue in tissues])
-        raised = raised.reshape(-1, len(segments))
+        raised = np.reshape([[segment in each.raised for segment in segments] for each in tissues], (-1, len(segments)))
         self._terms = (
             np.array([columns[name] for name in names], dtype=np.int64),
             np.array([columns.get(table.segments[name].soft_tissue.relative_to, -1) for name in segments], np.int64),
@@ -83,19 +82,14 @@ class SoftTissueCorrection:
             np.array([means[name].lag for name in names]),
             np.array([means[name].start for name in names]),
         )
-        self._is_needed = bool(names)
 
     def correct_segments(self, quat_WL: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Return segment → orientations (n, 4) xyzw, of all segments, as `correct`."""
-        if not self._is_needed:
-            return quat_WL
         quats = self.correct(np.stack(list(quat_WL.values()), axis=1))
         return {name: np.ascontiguousarray(quats[:, k]) for k, name in enumerate(quat_WL)}
 
     def correct(self, quat_WL: np.ndarray) -> np.ndarray:
         """Return the orientations (..., k, 4) xyzw of the segments from those that their sensors show."""
-        if not self._is_needed:
-            return quat_WL
         corrected = quat_WL.copy()
         _correct(corrected.reshape(-1, *quat_WL.shape[-2:]), *self._terms)
         return corrected

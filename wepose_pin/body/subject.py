@@ -262,12 +262,6 @@ class Subject:
             hinges[joint] = hinge._replace(axis=turn.apply(hinge.axis))
         return hinges
 
-    def fix_girdles(self, table: BodyTable) -> Subject:
-        """Return the subject with shoulders fixed on the trunk: its girdles move nothing."""
-        fixed = np.zeros(len(PARAMETERS))
-        fixed[PARAMETERS.index("law")] = -1.0
-        return replace(self, girdles=dict.fromkeys(table.girdles, fixed))
-
     def std(self, name: str) -> float:
         """Return one standard deviation of a row of `order`, in its unit; NaN where there is no such row."""
         if name not in self.order:
@@ -303,19 +297,6 @@ class Subject:
         if segment not in self.mounts or not set(rows) <= set(self.order):
             return None
         return self.lengths_covariance(rows)
-
-    def sample(self, rng: np.random.Generator) -> Subject:
-        """Return a random person from this one's distribution of lengths, for simulation."""
-        mean = np.array(list(self.lengths.values()))
-        drawn = np.clip(rng.multivariate_normal(mean, self.lengths_covariance()), 0.7 * mean, 1.3 * mean)
-        return replace(
-            self,
-            name="sampled",
-            quality="",
-            lengths=dict(zip(self.lengths, drawn.tolist(), strict=True)),
-            covariance=np.zeros_like(self.covariance),
-            note="a random person of the population",
-        )
 
 
 def mount_rows(segment: str) -> list[str]:
@@ -379,19 +360,20 @@ def population_subject(
     """
     check_arguments(population_subject, {"stature": stature, "sex": sex})
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
-    people = compute_population_lengths(table, stature, sex)
+    people, people_cov, note = compute_population_lengths(table, stature, sex)
     order = tuple(table.lengths)
-    lengths, covariance = dict(zip(people.names, people.mean.tolist(), strict=True)), np.zeros((len(order),) * 2)
+    lengths, covariance = dict.fromkeys(order, 0.0) | people, np.zeros((len(order),) * 2)
     for k, (name, length) in enumerate(table.lengths.items()):
-        if name not in lengths:
+        if name not in people:
             if not isinstance(body, BodyModel):
                 raise BadModel(f"{table.where}: lengths.{name} is no share of stature; its model is needed")
             lengths[name] = body.lengths[name]
             covariance[k, k] = (0.01 * length.std_percent * lengths[name]) ** 2
-    rows = [order.index(name) for name in people.names]
-    covariance[np.ix_(rows, rows)] = people.covariance
-    note = people.note if people.names else f"lengths of the model {table.name}"
-    return Subject(POPULATION, {name: lengths[name] for name in order}, order, covariance, note=note)
+    rows = [order.index(name) for name in people]
+    covariance[np.ix_(rows, rows)] = people_cov
+    return Subject(
+        POPULATION, lengths, order, covariance, note=note if people else f"lengths of the model {table.name}"
+    )
 
 
 def subject_toml(subject: Subject) -> str:

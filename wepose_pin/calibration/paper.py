@@ -28,6 +28,7 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import Rotation
 
+from ..body.girdle import FIXED
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
@@ -95,7 +96,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     )
     return Calibration(
         problem=problem,
-        subject=subject.fix_girdles(problem.model.table),
+        subject=replace(subject, girdles=dict.fromkeys(problem.model.table.girdles, FIXED)),
         effective_sample_size=len(gaps) / correlated,
         scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
         remarks=(*filtered.diagnostics, *mount_diagnostics),

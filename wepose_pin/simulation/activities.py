@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments
 from ..body import BodyModel, load_model
-from ..body.girdle import PARAMETERS
+from ..body.girdle import FIXED
 from ..body.links import compute_link_poses
 from ..errors import BadOption, one_of
 from ..rotations import compose, turn_about
@@ -382,7 +382,6 @@ def simulate_activity(
     rngs = spawn_streams(seed)
     model = load_model(ACTIVITIES[activity].body, lengths)
     # Shoulders that do not move: those of people that do are placed by their own girdle, not by the one tracked with.
-    rigid = -np.eye(len(PARAMETERS))[PARAMETERS.index("law")]
-    model = replace(model, girdles=dict.fromkeys(model.table.girdles, rigid))
+    model = replace(model, girdles=dict.fromkeys(model.table.girdles, FIXED))
     flaws = Flaws(imperfections, rngs, model.lengths)
     return measure_motion(ACTIVITIES[activity](model, rngs["motion"], seconds, flaws), rngs, rate_hz, noise)

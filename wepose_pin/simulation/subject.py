@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments, check_names
 from ..body import DEFAULT_BODY, SEXES, load_table
-from ..body.girdle import PARAMETERS
+from ..body.girdle import FIXED
 from ..body.kinematics import Pose
 from ..body.subject import BodyLength, Subject, population_subject
 from ..errors import BadOption
@@ -106,8 +106,7 @@ class Simulation:
 
         Without `Imperfections.girdle` they do not move; what a person has beside de Groot's regression is not in it.
         """
-        own = np.zeros(len(PARAMETERS))
-        own[PARAMETERS.index("law")] = min(self.imperfections.girdle, 1.0) - 1.0
+        own = (1.0 - min(self.imperfections.girdle, 1.0)) * FIXED
         return dict.fromkeys(load_table().girdles, own)
 
     def truth(self) -> Pose:
@@ -325,6 +324,9 @@ def simulate_person(seed: int, measured_std: float = MEASURED_STD, body: str = D
     stature = float(np.clip(rng.normal(mean, std), 1.45, 2.0))
     table = load_table(body)
     prior = population_subject(round(stature, 2), sex, table)
-    lengths = dict(population_subject(stature, sex, table).sample(rng).lengths)
+    people = population_subject(stature, sex, table)
+    usual = np.array(list(people.lengths.values()))
+    drawn = np.clip(rng.multivariate_normal(usual, people.lengths_covariance()), 0.7 * usual, 1.3 * usual)
+    lengths = dict(zip(people.lengths, drawn.tolist(), strict=True))
     measured = {name: lengths[name] + float(rng.normal(0.0, measured_std)) for name in MEASURED_LENGTHS}
     return Person(lengths, stature, sex, measured, measured_std, prior)
