@@ -1,4 +1,4 @@
-"""Kernels are compiled once and kept, and a place to keep them is not needed."""
+"""Kernels are compiled once and kept."""
 
 from __future__ import annotations
 
