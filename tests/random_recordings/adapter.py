@@ -9,9 +9,6 @@ import contextlib
 import io
 import json
 import re
-import subprocess
-import sys
-import time
 import traceback
 import warnings as python_warnings
 from collections.abc import Iterable, Mapping
@@ -33,7 +30,6 @@ from .sensors import DEG, GRAVITY
 CODES = {"calibrate": {0, 2, 3, 4}, "batch": {0, 2, 3}}
 USUAL_CODES = {0, 2}
 ACCEPTED = {"calibrate": {0, 3, 4}}
-COMMANDS: dict[str, str] = {}  # ours → the project's, where they differ
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
 
 # Codes of diagnostics that say why a segment is not to be believed, by cause; each counts for the segment that it is
@@ -63,7 +59,6 @@ class Outcome:
     code: int
     out: str
     err: str
-    seconds: float
     traceback: str = ""
 
 
@@ -224,10 +219,6 @@ def retarget(result: Path, out: Path) -> list[str]:
     return ["retarget", str(result), "--robot", "panda", "-o", str(out)]
 
 
-def batch(plan: Path, out: Path, workers: int) -> list[str]:
-    return ["batch", str(plan), "-o", str(out), "--workers", str(workers)]
-
-
 def codes(command: str) -> set[int]:
     """Exit codes that the documents promise."""
     return CODES.get(command, USUAL_CODES)
@@ -237,15 +228,8 @@ def accepted(command: str, code: int) -> bool:
     return code in ACCEPTED.get(command, {0})
 
 
-def run(argv: list[str], as_process: bool = False) -> Outcome:
-    """Run a command: in this process, or in one of its own as a user does."""
-    begin = time.perf_counter()
-    if as_process:
-        done = subprocess.run(
-            [sys.executable, "-m", "wepose_pin", *argv], capture_output=True, text=True, errors="replace"
-        )
-        failed = done.stderr if "Traceback (most recent call last)" in done.stderr else ""
-        return Outcome(argv, done.returncode, done.stdout, done.stderr, time.perf_counter() - begin, failed)
+def run(argv: list[str]) -> Outcome:
+    """Run a command in this process."""
     from wepose_pin.commands import main
 
     out, err, code, failed = io.StringIO(), io.StringIO(), 0, ""
@@ -261,7 +245,7 @@ def run(argv: list[str], as_process: bool = False) -> Outcome:
             if isinstance(error, KeyboardInterrupt):
                 raise
             code, failed = 1, traceback.format_exc()
-    return Outcome(argv, code, out.getvalue(), err.getvalue(), time.perf_counter() - begin, failed)
+    return Outcome(argv, code, out.getvalue(), err.getvalue(), failed)
 
 
 # Results -----------------------------------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def list_fitting(case: Case) -> list[str]:
     return fits
 
 
-def compare(case: Case, name: str, folder: Path, as_process: bool) -> tuple[Deviation | None, list[Failure], list]:
+def compare(case: Case, name: str, folder: Path) -> tuple[Deviation | None, list[Failure], list]:
     """Track both and compare; what was found, failures, and how the commands ended."""
     of = INVARIANCES[name]
     results, outcomes = [], []
@@ -107,7 +107,7 @@ def compare(case: Case, name: str, folder: Path, as_process: bool) -> tuple[Devi
         layout = type(layout)(layout.suffix, layout.gyro_in_deg, layout.accel_in_g, 15)
         session = adapter.write_session(folder / which, recorded, layout)
         options = case.options - {"report"}
-        outcome = adapter.run(adapter.track(session, folder / f"{which}-result", case.method, options), as_process)
+        outcome = adapter.run(adapter.track(session, folder / f"{which}-result", case.method, options))
         outcomes.append(outcome)
         if outcome.code:
             message = f"{which} of '{name}': exit {outcome.code}: {adapter.refusal(outcome)[-300:]}"

@@ -55,13 +55,11 @@ class Accuracy:
 
 def of_outcome(outcome: Outcome, out: object = None) -> list[Failure]:
     """The exit code, and how a refusal is said."""
-    command = outcome.argv[0]
-    ours = next((name for name, of in adapter.COMMANDS.items() if of == command), command)
     shown = " ".join(outcome.argv)
     if outcome.traceback:
         last = outcome.traceback.strip().splitlines()
         return [Failure("no traceback", shown, f"{last[-1]} | {_innermost(last)}")]
-    if outcome.code not in adapter.codes(ours):
+    if outcome.code not in adapter.codes(outcome.argv[0]):
         return [Failure("documented exit code", shown, f"exit {outcome.code}: {outcome.err.strip()[-300:]}")]
     failures = []
     if outcome.code == 2:

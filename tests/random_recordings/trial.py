@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -31,7 +30,6 @@ class Report:
     accuracy: dict[str, Any] = field(default_factory=dict)
     deviations: list[dict[str, Any]] = field(default_factory=list)  # one for each invariance
     recorded_s: float = 0.0
-    seconds: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -40,8 +38,8 @@ class Report:
 class Trial:
     """The commands of a case in a folder, and what came of them."""
 
-    def __init__(self, case: Case, folder: Path, as_process: bool = False) -> None:
-        self.case, self.folder, self.as_process = case, folder, as_process
+    def __init__(self, case: Case, folder: Path) -> None:
+        self.case, self.folder = case, folder
         self.report = Report(case.seed, case.describe())
         self.recorded: Recorded = record(case)
         self.report.recorded_s = case.duration
@@ -57,24 +55,22 @@ class Trial:
 
     def run(self, invariances_alone: bool = False) -> Report:
         """Run the steps and one invariance, or all invariances that can be tried and no step."""
-        begin = time.perf_counter()
         (self.folder / "about.txt").write_text(self.case.describe() + "\n", encoding="utf-8")
         for step in [] if invariances_alone else self.case.steps:
             if step in ("calibrate", "track", "info") or self.result is not None:
                 STEPS[step](self)
         for invariance in list_fitting(self.case) if invariances_alone else choose(self.case):
-            deviation, failures, outcomes = compare(self.case, invariance, self.folder / invariance, self.as_process)
+            deviation, failures, outcomes = compare(self.case, invariance, self.folder / invariance)
             self.report.failures += failures
             for outcome in outcomes:
                 self._count(outcome)
             if deviation is not None:
                 self.report.deviations.append(asdict(deviation))
-        self.report.seconds = time.perf_counter() - begin
         return self.report
 
     def command(self, argv: list[str], out: Path | None = None, acceptance: str | None = None) -> Outcome:
         """Run one, with the oracles of every command; `acceptance`: why it may be refused, None: as the case says."""
-        outcome = adapter.run(argv, self.as_process)
+        outcome = adapter.run(argv)
         self._count(outcome)
         failures = of_outcome(outcome, out)
         if not failures:
@@ -190,15 +186,15 @@ def _rounded(accuracy: Accuracy) -> dict[str, Any]:
     return {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
 
 
-def try_seed(seed: int, keep: Path | None = None, as_process: bool = False, invariances_alone: bool = False) -> Report:
+def try_seed(seed: int, keep: Path | None = None, invariances_alone: bool = False) -> Report:
     """Everything of one seed, in a folder that is removed, or kept under `keep`."""
     case = draw_case(seed)
     if keep is not None:
         shutil.rmtree(keep, ignore_errors=True)
         keep.mkdir(parents=True)
-        return Trial(case, keep, as_process).run(invariances_alone)
+        return Trial(case, keep).run(invariances_alone)
     with tempfile.TemporaryDirectory(prefix="random-recording-") as folder:
-        report = Trial(case, Path(folder), as_process).run(invariances_alone)
+        report = Trial(case, Path(folder)).run(invariances_alone)
         for failure in report.failures:
             failure.command = failure.command.replace(folder, "DIR")
             failure.message = failure.message.replace(folder, "DIR")
