@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -10,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from simulated import SEGMENTS, SUBJECT, G, multiply
+from simulated import SEGMENTS, SUBJECT, G
 
-from benchmarks.validation.single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from wepose_pin import (
     IDEAL_PRESET,
     NOISE_FREE,
@@ -26,7 +24,6 @@ from wepose_pin import (
 )
 from wepose_pin.writers import write_session
 
-SHORT = {"rate_hz": 20.0, "clasp_s": 5.0, "circles": 0, "noise": NOISE_FREE}
 SHORTER = {"clasp_s": 8.0, "circles": 1, "rate_hz": 50.0}
 # Of the body: imperfection -> it turns segments, and not only sensors on them.
 BODY = {"tissue_gain": False, "tissue_random": False, "sensor_place": False}
@@ -178,35 +175,3 @@ def test_switching_one_off_leaves_the_others_as_they_are(people: Simulation, nam
             assert np.array_equal(without.soft_tissue[segment], people.soft_tissue[segment])
         placed = name == "sensor_place" and segment != "torso"
         assert np.array_equal(without.p_LS[segment], people.p_LS[segment]) != placed
-
-
-# One sensor ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "moving", "rate_peak", "accel_peak"),
-    [
-        (simulate_paper_dynamic, (5.0, 55.0), (6.0, 8.0), (15.0, 20.0)),
-        (simulate_paper_drift, (25.0, 35.0), (13.0, 15.0), (40.0, 50.0)),
-    ],
-)
-def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_peak: tuple, accel_peak: tuple) -> None:
-    for seed in range(3):
-        one = make(seed, 1000.0, noise=NOISE_FREE)
-        assert one.moving == moving
-        assert one.time[-1] == 60.0
-        R_WS = Rotation.from_quat(one.quat_WS)
-        for end in (30000, 60000):
-            assert (multiply(one.gyro_S[1 : end + 1] / 1000.0).inv() * R_WS[0].inv() * R_WS[end]).magnitude() < 1e-6
-        accel_W = R_WS.apply(one.accel_S) - [0.0, 0.0, G]
-        k = slice(int(moving[0] * 1000) - 1000, int(moving[0] * 1000) + 9001)  # 10 s from before the motion
-        integrated = one.p_WS[k][0] + CubicSpline(one.time[k], accel_W[k]).antiderivative(2)(one.time[k])
-        assert np.abs(integrated - one.p_WS[k]).max() < 1e-3
-        for a, b in one.static:
-            rest = (one.time > a + 0.01) & (one.time < b - 0.01)
-            assert np.abs(one.gyro_S[rest]).max() < 1e-12
-            np.testing.assert_allclose(np.linalg.norm(one.accel_S[rest], axis=1), G, atol=1e-9)
-        for values, peak in ((one.gyro_S, rate_peak), (accel_W, accel_peak)):
-            assert peak[0] * 0.97 < np.linalg.norm(values, axis=1).max() < peak[1] * 1.03
-        assert np.abs(one.p_WS).max() < 0.8  # within reach of an arm

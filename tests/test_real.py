@@ -9,12 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.trials import (
-    RING_MOUNTS,
-    RING_SEGMENTS,
     Referenced,
-    read_broad,
-    read_ring,
-    read_ur5,
 )
 from benchmarks.validation import real
 from benchmarks.validation.experiment import run_experiment
@@ -71,21 +66,6 @@ def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
         register_sensors([apart._replace(time=apart.time + 0.31)], (6.0, 16.0))
 
 
-def test_ring_is_read_as_it_is(data: Path) -> None:
-    chain = read_ring(data / "ring" / "trial1")
-    assert set(chain.sensors) == {(mount, segment) for mount in RING_MOUNTS for segment in RING_SEGMENTS}
-    lost = [np.isnan(quat).any(axis=1) for quat in chain.quat_VB.values()]
-    assert all(np.array_equal(lost[0], each) for each in lost)
-    assert lost[0].sum() == 223
-    for sensor in chain.sensors.values():
-        assert sensor.rate_hz == 40.0
-        assert np.median(np.linalg.norm(sensor.accel_S, axis=1)) == pytest.approx(9.9, abs=0.3)
-    lengths = real.fit_optical_links(chain).lengths
-    assert lengths["seg2"] == pytest.approx(0.289, abs=1.5e-3)
-    assert lengths["seg3"] == pytest.approx(0.289, abs=1.5e-3)
-    assert lengths["seg4"] == pytest.approx(0.2705, abs=1e-3)
-
-
 def means(data: Path, experiment: str) -> dict[str, dict[str, float]]:
     summary = run_experiment(real.list_experiments(data)[experiment], workers=1)
     assert not summary.skipped
@@ -115,46 +95,8 @@ def test_link_lengths_from_orientations_and_tip(data: Path) -> None:
                 assert abs(mean[method][link] - optical) < limit_mm
 
 
-def test_ur5_is_read_as_it_is(data: Path) -> None:
-    for recording, sensor, begins_s in (("circle-100", "carpus", 0.9), ("triangle-250", "radius", 4.2)):
-        trial = read_ur5(data, recording, sensor)
-        assert trial.rate_hz == pytest.approx(125.0)
-        assert trial.static.stop / trial.rate_hz == pytest.approx(begins_s, abs=0.3)
-        at_rest = np.linalg.norm(trial.accel_S[trial.static], axis=1).mean()
-        assert at_rest == pytest.approx(0.97 * 9.81, abs=0.2)
-
-
 def test_the_filters_on_ur5(data: Path) -> None:
     assert len(real.list_experiments(data)["UR5"]) == 7
     mean = means(data, "UR5")
     for method in ("smekf", "ncf", "gdc"):
         assert mean[method]["total [deg]"] < 1.5
-
-
-def test_broad_needs_no_registration(data: Path) -> None:
-    """Its authors have aligned it: half a sample of the gyroscope's interval is left, and what ten seconds can tell."""
-    trial = read_broad(data / "broad" / "01_undisturbed_slow_rotation_A.mat")
-    first = int(np.argmax(trial.scored))
-    part = slice(first - 800, first + 2860)
-    gyro = trial.gyro_S[part] - trial.gyro_S[trial.static].mean(axis=0)
-    time = np.arange(len(gyro)) / trial.rate_hz
-    sensor = Referenced(
-        trial.name, trial.rate_hz, gyro, trial.accel_S[part], time, trial.quat_true[part], trial.static
-    )._replace(static=slice(0, 0))
-    (registration,) = register_sensors([sensor], (0.0, 12.8))
-    assert registration.offset_s == pytest.approx(0.5 / trial.rate_hz, abs=1e-3)
-    assert np.degrees(Rotation.from_quat(registration.quat_BS).magnitude()) < 0.3
-    assert registration.tilt_deg < 0.4
-
-
-def test_broken_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(WeposeError, match=r"omc\.csv"):
-        read_ring(tmp_path)
-    with pytest.raises(WeposeError, match=r"carpus_adx\.csv"):
-        read_ur5(tmp_path, "circle-250", "carpus")
-    (tmp_path / "omc.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(WeposeError, match=r"omc\.csv: begins with 'a,b'.*sampling frequency"):
-        read_ring(tmp_path)
-    (tmp_path / "omc.csv").write_text("# sampling frequency: 30\na,b\n1,2\n")
-    with pytest.raises(WeposeError, match=r"no column 'seg1_quat_w' in .*omc\.csv"):
-        read_ring(tmp_path)

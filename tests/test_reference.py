@@ -167,26 +167,6 @@ def test_wepose_info_says_what_joints_there_are(
     assert "left_elbow" in out
 
 
-def test_rotations_without_a_rate_have_that_of_the_points_times_their_ratio(brief: Pose, tmp_path: Path) -> None:
-    raw = theia(tmp_path / "a.c3d", brief, ratio=2).read_bytes()
-    rate = raw.rindex(b"RATE")  # ezc3d always writes it
-    (tmp_path / "a.c3d").write_bytes(raw[:rate] + b"LATE" + raw[rate + 4 :])
-    time = read_reference(tmp_path / "a.c3d").time
-    np.testing.assert_allclose(np.diff(time), 0.5 / LAB_HZ)
-
-
-def test_a_header_may_count_more_frames_than_there_are(brief: Pose, tmp_path: Path) -> None:
-    """As Optotrak's, which says 1149: the points that are there count."""
-    path = c3d(tmp_path / "a.c3d", brief)
-    whole = read_reference(path)
-    raw = bytearray(path.read_bytes())
-    struct.pack_into("<HH", raw, 6, 1, 1149)
-    path.write_bytes(raw)
-    reference = read_reference(path)
-    np.testing.assert_array_equal(reference.time, whole.time)
-    np.testing.assert_array_equal(reference.points["left_elbow"], whole.points["left_elbow"])
-
-
 @pytest.mark.parametrize(("write", "name"), [(c3d, "a.c3d"), (trc, "a.trc")])
 def test_joints_and_segments_follow_from_markers(
     write: Callable[[Path, Pose], Path], name: str, brief: Pose, tmp_path: Path

@@ -108,14 +108,6 @@ def test_it_begins_and_ends_at_rest_and_shows_the_recording_to_its_end(swung: re
     assert swung.recorded_time[-1] == pytest.approx(7.99, abs=0.02)
 
 
-def test_a_link_may_have_the_name_of_its_fixed_joint(tmp_path: Path) -> None:
-    urdf = write_arm(tmp_path)
-    plain = retargeting.retarget(person(2.0), str(urdf))
-    text = urdf.read_text(encoding="utf-8").replace('joint name="stand"', 'joint name="base"')
-    urdf.write_text(text, encoding="utf-8")
-    np.testing.assert_array_equal(retargeting.retarget(person(2.0), str(urdf)).joint_position, plain.joint_position)
-
-
 @pytest.mark.slow
 def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     straight = retargeting.retarget(person(4.0), arm)

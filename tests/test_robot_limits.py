@@ -14,7 +14,7 @@ from test_live_robot import Session, keeps_its_limits, live_poses
 from wepose_pin import errors, retargeting
 from wepose_pin.body.kinematics import Pose
 from wepose_pin.retargeting import limits
-from wepose_pin.retargeting.collision import NEAR, CollisionModel
+from wepose_pin.retargeting.collision import CollisionModel
 
 pytest.importorskip("daqp")
 
@@ -103,32 +103,6 @@ def test_a_stop_keeps_the_limits_and_ends_at_rest(dt: float) -> None:
         assert (np.abs(np.diff(acceleration, axis=0)) <= dt * j_max + 1e-6).all()
         assert (np.abs(np.diff(path, axis=0)) <= travel[:-1] + 1e-12).all()
         assert len(path) * dt < 3.0
-
-
-def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: retargeting.Robot) -> None:
-    """Straight ways between random postures: one is refused where some sample of it is too near, and seldom else."""
-    collision = CollisionModel(arm)
-    every = np.arange(len(collision.pairs))
-    rng, data = np.random.default_rng(1), arm.model.createData()
-    share = np.linspace(0.0, 1.0, 41)[:, None]
-    refused = 0
-    for _ in range(60):
-        begin = rng.uniform(*arm.bounds)
-        path = begin + share * rng.normal(0.0, 1.0, len(begin))
-        rooms = []
-        for position in path:
-            pin.forwardKinematics(arm.model, data, arm.configuration(position))
-            rooms.append(collision.compute_distances(data, every))
-        room = np.array(rooms) - collision.least_distance
-        if room[0].min() < 0.0:
-            continue
-        travel = np.abs(np.diff(path, axis=0))
-        clear = collision.is_path_clear(np.minimum(rooms[0], NEAR), path[1:], travel)
-        assert clear == (room.min() >= 0.0) or abs(room.min()) < 1e-3
-        refused += not clear
-        moved = np.abs(np.diff(np.array(rooms), axis=0))
-        assert (moved <= travel @ collision.levers.T + 1e-6).all()
-    assert 5 < refused < 50
 
 
 def pushed(seconds: float, hz: float) -> Pose:

@@ -1,7 +1,5 @@
 """The simulator against what shares no code with it: integrals, splines, geometry of the points."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from bodies import LENGTHS
@@ -94,17 +92,6 @@ def test_rests_and_start_are_exactly_still(perfect: Simulation) -> None:
         np.testing.assert_allclose(np.linalg.norm(perfect.accel_S[segment][still], axis=1), G, rtol=0, atol=1e-12)
     hand = perfect.points["right_palm"][within(perfect, "rest")]
     assert np.abs(hand - hand[0]).max() < 1e-12  # always the same point of the table
-
-
-def test_six_circles_between_the_rests(perfect: Simulation) -> None:
-    (lift, back), rests = perfect.phases["circles"][0], perfect.phases["rest"]
-    table = perfect.points["right_palm"][within(perfect, "rest")][0]
-    away = np.linalg.norm(perfect.points["right_palm"] - table, axis=1)
-    t = perfect.time
-    assert away[(t > rests[0][0]) & (t <= lift)].max() < 1e-12
-    assert away[t >= back].max() < 1e-12
-    for (_, a), (b, _) in pairwise(rests):
-        assert away[(t > a) & (t < b)].max() > 0.2
 
 
 def test_stated_axes_and_gravity_give_the_mount(perfect: Simulation) -> None:
