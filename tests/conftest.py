@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import os
 import resource
 import tempfile
 import time
-import tomllib
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -32,8 +30,7 @@ os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"wepose-pin-n
 from numba.core.compiler_lock import global_compiler_lock  # noqa: E402
 from numba.core.dispatcher import Dispatcher  # noqa: E402
 
-from wepose_pin.recording import Recording  # noqa: E402
-from wepose_pin.simulation import Person, Simulation, simulate, simulate_person  # noqa: E402
+from wepose_pin import Person, Recording, Simulation, simulate, simulate_person  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("WEPOSE_DATA") or ROOT.parent / "shared" / "data")
@@ -89,12 +86,8 @@ Dispatcher.compile = _compile_in_one_process
 
 # What the suite costs ------------------------------------------------------------------------------------------------
 
-# Tests of one of these markers belong to the second tier: `make test-all` runs them, `make test` does not.
-_PYTEST = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pytest"]["ini_options"]
-SECOND_TIER = tuple(line.partition(":")[0] for line in _PYTEST["markers"])
 _START = time.monotonic()
 _LAST = pytest.StashKey[float]()
-_TIERS: Counter[str] = Counter()
 _WORKERS: dict[str, float] = {}
 
 
@@ -102,19 +95,6 @@ def processor_time() -> float:
     """Processor time of this process, all its threads, and the children that it waited for [s]."""
     own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
     return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--costs", metavar="FILE", help="write the processor and wall time of each test [s] to FILE as JSON"
-    )
-
-
-@pytest.hookimpl(tryfirst=True)  # before -m takes any out
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        markers = [name for name in SECOND_TIER if item.get_closest_marker(name)]
-        _TIERS.update(markers or ["first tier"])
 
 
 @pytest.hookimpl(wrapper=True)
@@ -133,38 +113,24 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["cost"] = {"processor_s": processor_time(), "tiers": dict(_TIERS)}
+        session.config.workeroutput["processor_s"] = processor_time()
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: object) -> None:
-    if cost := getattr(node, "workeroutput", {}).get("cost"):
-        _WORKERS[node.gateway.id] = cost["processor_s"]
-        _TIERS.clear()
-        _TIERS.update(cost["tiers"])
+    _WORKERS[node.gateway.id] = getattr(node, "workeroutput", {}).get("processor_s", 0.0)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    skipped = [report for report in terminalreporter.stats.get("skipped", []) if _WITHOUT_DATA in str(report.longrepr)]
-    terminalreporter.write_line(f"tests skipped for want of the real recordings: {len(skipped)}")
-
+    reports = [report for reports in terminalreporter.stats.values() for report in reports]
+    skipped = [report for report in reports if _WITHOUT_DATA in str(getattr(report, "longrepr", ""))]
     processor: Counter[str] = Counter()
-    wall: Counter[str] = Counter()
-    phases: dict[str, dict[str, float]] = defaultdict(dict)
-    for report in (report for reports in terminalreporter.stats.values() for report in reports):
-        if hasattr(report, "processor_s"):
-            processor[report.nodeid] += report.processor_s
-            wall[report.nodeid] += report.duration
-            phases[report.nodeid][report.when] = report.processor_s
+    for report in (report for report in reports if hasattr(report, "processor_s")):
+        processor[report.nodeid] += report.processor_s
     total = sum(_WORKERS.values()) or processor_time()
     terminalreporter.section("what the suite costs")
+    terminalreporter.write_line(f"tests skipped for want of the real recordings: {len(skipped)}")
     terminalreporter.write_line(f"wall time {time.monotonic() - _START:.0f} s, processor time {total:.0f} s")
-    terminalreporter.write_line(
-        f"tests run: {len(processor)}; collected: " + ", ".join(f"{n} {tier}" for tier, n in _TIERS.most_common())
-    )
     terminalreporter.write_line("the ten that take most processor time [s]:")
     for nodeid, seconds in processor.most_common(10):
         terminalreporter.write_line(f"{seconds:7.1f}  {nodeid}")
-    if file := terminalreporter.config.getoption("--costs"):
-        costs = {nodeid: {"wall": wall[nodeid], **phases[nodeid]} for nodeid in processor}
-        Path(file).write_text(json.dumps({"processor_s": total, "tests": costs}, indent=1), encoding="utf-8")
