@@ -29,23 +29,6 @@ def test_compiled_once_and_kept(tmp_path: Path) -> None:
     assert kept
     assert _fresh(announced, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")} == kept
-<<<<<<< HEAD
-=======
-
-
-def test_a_full_disk_is_no_error(tmp_path: Path) -> None:
-    assert _fresh(_FULL_DISK + _FIRST_USE, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
-
-
-def test_nowhere_to_keep_what_is_compiled_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def without_a_folder(**options: Any) -> Any:
-        if options.pop("cache", False):
-            raise RuntimeError("cannot cache function: no locator available")
-        return njit(**options)
-
-    monkeypatch.setattr(compilation, "njit", without_a_folder)
-    for decorator in (compilation.compiled, compilation.kernel):
-        assert decorator(lambda x: x + 1.0)(1.0) == 2.0
 
 
 def test_neither_tracking_nor_calibration_loads_the_statistics_of_scipy() -> None:
@@ -55,4 +38,3 @@ def test_neither_tracking_nor_calibration_loads_the_statistics_of_scipy() -> Non
         "print(sorted({'scipy.signal', 'scipy.stats', 'scipy.optimize'} & set(sys.modules)))"
     )
     assert _fresh(code) == "[]\n"
->>>>>>> 9b3ca7d3 (Tables, benchmarks and robots: each promise once)

@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.results import adapter, inputs, saving, tasks
 from benchmarks.results.__main__ import main
-<<<<<<< HEAD
 from benchmarks.results.arrays import Arrays
-=======
-from benchmarks.results.arrays import file_values, folder_values
->>>>>>> 9b3ca7d3 (Tables, benchmarks and robots: each promise once)
 from benchmarks.results.comparison import difference_of
 
 
@@ -70,7 +67,6 @@ def test_compare_with_renames_and_reasons(
     table.write_text(table.read_text() + "[reasons]\n'^a/' = 'another a'\n")
     assert run(monkeypatch, "compare", old, new, "--renames", table) == 0
     assert "explained: 3 keys: another a" in capsys.readouterr().out
-<<<<<<< HEAD
 
 
 @pytest.fixture
@@ -104,5 +100,3 @@ def test_two_saves_are_bit_identical(
     assert "0 different, 0 missing, 0 new" in capsys.readouterr().out
     keys = set(np.load(a / "results" / "chain.npz").files)
     assert {"track/chain/amekf/whole/joints/elbow", "track/chain/amekf/whole/exit_code"} <= keys
-=======
->>>>>>> 9b3ca7d3 (Tables, benchmarks and robots: each promise once)
