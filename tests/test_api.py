@@ -26,7 +26,7 @@ from docs.diagnostics_page import list_examples
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
 from wepose_pin.recording import find_mount_axes
-from wepose_pin.simulation import Imperfections, ImuNoise, Simulation
+from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -162,15 +162,6 @@ def test_without_pandas_one_line_says_how_to_install_it(
     assert str(caught.value).endswith("pip install pandas")
 
 
-@pytest.mark.parametrize("part", ['"diagnostics": [3]', '"diagnostics": [{}]'])
-def test_a_damaged_summary_is_one_line(part: str, saved: Path, tmp_path: Path) -> None:
-    for name in ("pose.parquet", "subject.toml", "subject.urdf"):
-        (tmp_path / name).write_bytes((saved / name).read_bytes())
-    (tmp_path / "summary.json").write_text(f"{{{part}}}", encoding="utf-8")
-    with pytest.raises(wp.WeposeError, match=r"summary\.json: cannot be read as the summary of a result"):
-        wp.load_result(tmp_path)
-
-
 def test_figures_are_whole_files_and_a_notebook_shows_them(result: wp.TrackResult, tmp_path: Path) -> None:
     figures = result.plot()
     page = figures._repr_html_()
@@ -258,13 +249,6 @@ def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult
     objects += [result.source]
     for each in objects:
         assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
-
-
-def test_settings_print_what_differs_from_their_defaults() -> None:
-    settings = [Imperfections(dropped=0.002, mount="any"), ImuNoise(correlation_s=10.0), wp.StaticTest(alpha=3.0)]
-    printed = ["Imperfections(mount='any', dropped=0.002)", "ImuNoise(correlation_s=10.0)", "StaticTest(alpha=3.0)"]
-    assert [repr(each) for each in settings] == printed
-    assert [repr(type(each)()) for each in settings] == ["Imperfections()", "ImuNoise()", "StaticTest()"]
 
 
 def test_objects_show_themselves_in_a_notebook(simulated: Simulation, result: wp.TrackResult, tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-
-from wepose_pin.commands import main
+from commands import run
 
 RATE = 100.0
 SESSION = """
@@ -301,10 +300,8 @@ def test_bad_input_is_told_in_one_line(name: str, tmp_path: Path, capsys: pytest
 
 
 def refused(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(argv)
-    printed = capsys.readouterr()
-    assert stop.value.code == 2
+    code, printed = run(*argv), capsys.readouterr()
+    assert code == 2
     assert printed.out == ""
     lines = printed.err.splitlines()
     assert len(lines) == 1, printed.err
@@ -312,9 +309,7 @@ def refused(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["track", str(Files(tmp_path, good_table()).write()), "-o", str(tmp_path / "out")])
-    assert stop.value.code == 0
+    assert run(*["track", str(Files(tmp_path, good_table()).write()), "-o", str(tmp_path / "out")]) == 0
     (printed,) = capsys.readouterr().err.splitlines()
     assert printed.startswith("info: There is no sensor on left upper arm")  # the files hold a torso alone
     assert (tmp_path / "out" / "pose.parquet").is_file()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -142,26 +141,6 @@ def test_where_a_study_may_not_go(study: Path) -> None:
     (study / "file").write_text("")
     with pytest.raises(ExistingOutput, match="is there and no study"):
         run(study, out="file")
-
-
-def test_both_groups_of_items_have_all_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Calibrations of subjects come first, then the sessions; the caller's variables stay as they are."""
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "session.toml").write_text("[data]\nfile = 3\n")
-    (tmp_path / "table.csv").write_text("session,subject\na,a\nb,b\n")
-    plan = ['[sessions]\ntable = "table.csv"', "[steps.calibrate]", "[steps.track]"]
-    (tmp_path / "plan.toml").write_text("\n".join([*plan, *(f'[subjects.{n}]\ncalibration = "{n}"' for n in "ab")]))
-    monkeypatch.setenv("WEPOSE_THREADS", "2")
-    before, processes = os.environ.copy(), list[int]()
-    run_batch(
-        tmp_path / "plan.toml",
-        str(tmp_path / "out"),
-        progress=lambda rows, *_: processes.append(len(multiprocessing.active_children())) if rows else None,
-    )
-    assert len(processes) == 4
-    assert min(processes) >= 2  # those of the first group may be about to end
-    assert os.environ == before
 
 
 def test_an_item_that_kills_its_process_is_named_and_the_others_go_on(study: Path, tmp_path: Path) -> None:

@@ -65,22 +65,6 @@ def test_help_is_grouped(capsys: pytest.CaptureFixture[str]) -> None:
     assert places == sorted(places)
 
 
-def test_words_become_arguments() -> None:
-    words = "calibrate s.toml --measured biacromial=0.4 --protocol table --measured trunk=0.5 --sex f -o out"
-    command, bound = parse(words.split())
-    assert (command.__name__, bound.args) == ("calibrate", (Path("s.toml"),))
-    measured = {"biacromial": 0.4, "trunk": 0.5}
-    assert bound.kwargs == {"measured": measured, "protocol": "table", "sex": "f", "out": Path("out")}
-    _, bound = parse("track --out=out s.toml --subject anna --no-limits --open-loop --covariance".split())
-    given = {"subject": Path("anna"), "limits": False, "open_loop": True, "covariance": True, "out": Path("out")}
-    assert (bound.args, bound.kwargs) == ((Path("s.toml"),), given)
-    _, bound = parse("export a b c -o x.csv --interval -1 2".split())
-    assert bound.args == (Path("a"), Path("b"), Path("c"))
-    assert bound.kwargs == {"out": Path("x.csv"), "interval": (-1.0, 2.0)}
-    _, bound = parse("simulate -o out --imperfection bits=12 --imperfection mount=any".split())
-    assert bound.kwargs["imperfection"] == {"bits": 12.0, "mount": "any"}
-
-
 @pytest.mark.slow
 def test_demo_makes_all_of_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -192,27 +192,3 @@ def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> N
     file.write_text(re.sub(r"(?m)^srdf = .*\n", "", file.read_text(encoding="utf-8")), encoding="utf-8")
     robot = read_map(file, urdf=file)  # the URDF itself is example-robot-data's
     assert set(robot.rest) <= set(robot.arms["right"].joints)
-
-
-def test_commands_of_recipes_name_what_is_there() -> None:
-    text = "".join(block for page in PAGES for block in blocks(page, ""))
-    tests = set(re.findall(r"tests/\w+\.py", text))
-    assert len(tests) > 5
-    assert [path for path in tests if not (ROOT / path).is_file()] == []
-    commands = set(re.findall(r"^wepose (\w+)|&& wepose (\w+)", text, re.MULTILINE))
-    assert {a or b for a, b in commands} <= set(COMMANDS)
-    for module in set(re.findall(r"python -m ([\w.]+)", text)) - {"pytest"}:
-        assert import_module(module)
-
-
-PAGES_WITH_LINKS = [path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))]
-
-
-@pytest.mark.parametrize("page", PAGES_WITH_LINKS)
-def test_links_lead_somewhere(page: str) -> None:
-    targets = re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text_of(page)))
-    files = [target.partition("#")[0] for target in targets if "://" not in target]
-    missing = [file for file in files if file and not (ROOT / page).parent.joinpath(file).exists()]
-    # What the build of the site makes is named by what makes it.
-    making = "".join(path.read_text(encoding="utf-8") for path in ROOT.glob("docs/**/*.py"))
-    assert [file for file in missing if not file.startswith("generated/") or Path(file).name not in making] == []

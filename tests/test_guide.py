@@ -26,7 +26,6 @@ from wepose_pin.live import Output, Request, SensorSetup, Status
 from wepose_pin.live.guide import Guide, GuideOptions
 from wepose_pin.live.steps import make_steps
 from wepose_pin.readers.live_log import read_live_log
-from wepose_pin.recording.arrivals import Samples
 
 CLASP = Path(__file__).parents[1] / "calibration" / "clasp.toml"
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
@@ -201,18 +200,6 @@ def test_rates_in_deg_s_are_said_before_a_sensor_is_shaken(tmp_path: Path) -> No
     assert moment.step in ("sensors", "assignment")
     assert "rad/s while gravity does not turn: deg/s? The source must give rad/s" in moment.view.note
     assert moment.time < 10.0
-
-
-def test_a_sensor_of_which_a_read_has_no_sample_does_not_send(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    session = Session(tmp_path)
-    end_s = session.run(lambda m: m.step == "assignment")[-1].time + 1.0
-    empty = [Samples("silent", np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))]
-    read = session.source.read
-    monkeypatch.setattr(session.source, "read", lambda timeout_s: empty + read(timeout_s))
-    session.guide.loop(lambda: session.guide.now > end_s)
-    assert session.guide.step.name == "assignment"
-    assert list(session.guide.monitor.sending) == list(session.person.worn)
-    session.guide.close()
 
 
 def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> None:

@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from bodies import SEGMENTS
-from device_files import ACCEL, GYRO, RATE, TIME, WXYZ, dot, mat, mt_manager, mvnx, sto, turning, ximu3
+from commands import run
+from device_files import ACCEL, GYRO, RATE, TIME, dot, mt_manager, mvnx, turning, ximu3
 
 import wepose_pin as wp
-from wepose_pin.commands import main
-from wepose_pin.recording import Recording
-from wepose_pin.tracking import summarize, track
+from wepose_pin.writers import write_session
 
 
 def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(["info", *map(str, argv)])
+    exit_code = run("info", *argv)
     out, err = capsys.readouterr()
-    assert stop.value.code == code, err
+    assert exit_code == code, err
     assert code == 0 or (out == "" and err.count("\n") == 1)
     return out if code == 0 else err
 
 
-def written(capsys: pytest.CaptureFixture[str], path: Path) -> Recording:
+def written(capsys: pytest.CaptureFixture[str], path: Path) -> wp.Recording:
     """The recording by the session that info writes beside the file."""
     info(capsys, path, "--write")
     return wp.load_session(path.absolute().parent / "session.toml")
@@ -51,14 +47,8 @@ def test_an_mvnx_with_all_its_segments(capsys: pytest.CaptureFixture[str], tmp_p
     assert 'file = "trial.mvnx"' in text
     assert not (tmp_path / "session.toml").exists()
     recording = written(capsys, path)
-    assert list(recording.sensors) == [
-        "torso",
-        "left_upper_arm",
-        "left_forearm",
-        "right_upper_arm",
-        "pelvis",
-        "left_hand",
-    ]
+    segments = "torso left_upper_arm left_forearm right_upper_arm pelvis left_hand"
+    assert list(recording.sensors) == segments.split()
     assert all(sensor.aligned for sensor in recording.sensors.values())
     text = info(capsys, path, "--write", "--force")  # aligned orientations can be tracked at once
     assert f"wepose track {tmp_path / 'session.toml'} -o result" in text
@@ -98,23 +88,6 @@ def test_a_rate_is_proposed_for_files_without_one(capsys: pytest.CaptureFixture[
     session = (tmp_path / "session.toml").read_text(encoding="utf-8")
     assert session.count("rate_hz = 100.0   # CHECK: the file does not say its rate") == 1
     assert recording.rate_hz == pytest.approx(100.0, rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (mt_manager, "chest.txt"),
-        (lambda path: dot(path, tag="D422CD00"), "chest.csv"),
-        (sto, "a.sto"),
-        (mat, "a.mat"),
-    ],
-)
-def test_each_format_by_what_it_says_of_its_segment(
-    make: Callable[[Path], Path], name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    recording = written(capsys, make(tmp_path / name))
-    assert "torso" in recording.sensors
-    assert len(recording) == len(TIME)
 
 
 def test_an_ximu3_folder_and_what_to_check(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -209,27 +182,6 @@ def test_the_start_phase_is_one_in_which_no_sensor_moves(capsys: pytest.CaptureF
     assert "start = [[2.50" in text
 
 
-@pytest.mark.parametrize("mounts", [True, False])
-def test_what_can_be_done_with_the_session_is_said(
-    mounts: bool, capsys: pytest.CaptureFixture[str], simulation, tmp_path: Path
-) -> None:
-    """Raw sensors of unknown mount cannot be tracked; `wepose calibrate` finds the mounts of five of them."""
-    recording = simulation.recording("made")
-    columns = {"time": recording.time[:500]}
-    for segment in SEGMENTS[: 5 if mounts else 2]:
-        sensor = recording.sensors[segment]
-        for k, axis in enumerate("xyz"):
-            columns |= {
-                f"{segment}_gyr_{axis}": sensor.gyro_S[:500, k],
-                f"{segment}_acc_{axis}": sensor.accel_S[:500, k],
-            }
-    pl.DataFrame(columns).write_csv(tmp_path / "a.csv")
-    text = info(capsys, tmp_path / "a.csv", "--write")
-    assert "wepose calibrate" in text
-    session = (tmp_path / "session.toml").read_text(encoding="utf-8")
-    assert ("# clasp = [[" in session) == mounts
-
-
 @pytest.mark.parametrize(("begin", "seconds"), [(0.0, 8.0), (40.0, 100.0), (1.7e9, 66.0)])
 def test_a_session_is_readable_once_the_marks_of_its_comments_are_gone(
     begin: float, seconds: float, capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -267,13 +219,6 @@ def test_what_cannot_be_read_is_said_and_a_session_still_proposed(
     assert "[sensors.torso]" in text
 
 
-def test_two_columns_of_times_of_one_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    content = table().write_csv().replace("time", "time,time", 1).splitlines()
-    rows = [content[0], *(f"{line.partition(',')[0]},{line}" for line in content[1:])]
-    (tmp_path / "a.csv").write_text("\n".join(rows))
-    assert "rate_hz = 100.0   # CHECK: no column looks like time" in info(capsys, tmp_path / "a.csv")
-
-
 def test_a_table_that_holds_no_sensor(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     pl.DataFrame({"time": TIME, "temperature": TIME}).write_csv(tmp_path / "a.csv")
     assert "no gyroscope and accelerometer" in info(capsys, tmp_path / "a.csv")
@@ -281,22 +226,17 @@ def test_a_table_that_holds_no_sensor(capsys: pytest.CaptureFixture[str], tmp_pa
 
 
 def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simulation, person, tmp_path: Path) -> None:
-    from wepose_pin.body.subject import subject_toml
-    from wepose_pin.writers import write_result, write_session
-
     recording = simulation.recording("made")
     (tmp_path / "session").mkdir()
     write_session(tmp_path / "session", recording, simulation.truth())
     text = info(capsys, tmp_path / "session")
     assert "a session, 'made'" in text
     assert "phase start [s]" in text
-    (tmp_path / "subject.toml").write_text(subject_toml(person.prior), encoding="utf-8")
+    person.prior.save(tmp_path / "subject.toml")
     text = info(capsys, tmp_path / "subject.toml")
     assert "a subject, '" in text
     assert "left_upper_arm" in text
-    (tmp_path / "result").mkdir()
-    tracked = track(recording, person.prior)
-    write_result(tmp_path / "result", tracked, summarize(tracked))
+    wp.track(recording, person.prior).save(tmp_path / "result")
     text = info(capsys, tmp_path / "result")
     assert "a result of `wepose track`" in text
     assert "a pose, as `wepose track` writes it" in info(capsys, tmp_path / "result" / "pose.parquet")
@@ -333,22 +273,6 @@ def test_files_that_are_wrong_are_one_line(
 def test_nothing_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert "none.mvnx: no such file" in info(capsys, tmp_path / "none.mvnx", code=2)
     assert "a folder without session.toml" in info(capsys, tmp_path, code=2)
-
-
-def test_quaternions_of_a_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    names = ["t", *(f"left_hand_q{c}" for c in "wxyz")]
-    pl.DataFrame(np.column_stack([TIME, WXYZ]), schema=names).write_csv(tmp_path / "a.csv")
-    recording = written(capsys, tmp_path / "a.csv")
-    np.testing.assert_allclose(recording.sensors["left_hand"].quat_VS[:, 3], WXYZ[:, 0], atol=1e-6)
-
-
-def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    frames = [table(f"seg{k}_gyr_{{}} seg{k}_acc_{{}}", sensor=k).drop("time") for k in (1, 2, 3)]
-    pl.concat([table().select("time"), *frames], how="horizontal").write_csv(tmp_path / "a.csv")
-    text = info(capsys, tmp_path / "a.csv")
-    assert text.count("# [sensors.SEGMENT]") == 3
-    assert "[sensors.torso]" not in text
-    assert "write its segment in place of SEGMENT" in info(capsys, tmp_path / "a.csv", "--write")
 
 
 # What is guessed ---------------------------------------------------------------------------------------------------
