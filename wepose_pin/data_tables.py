@@ -151,9 +151,6 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
     return numbers.fill_null(float("nan")).rename(name)
 
 
-# Checks of files ---------------------------------------------------------------------------------------------------
-
-
 def _is_parquet(path: Path) -> bool:
     """Return whether a file is Parquet, else it is a CSV; raise `MissingFile` where it is no table."""
     if path.is_dir():
@@ -164,9 +161,6 @@ def _is_parquet(path: Path) -> bool:
         beside = [p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS] if path.parent.is_dir() else []
         raise MissingFile(f"{path}: no such file; {one_of(sorted(beside), path.name)}")
     return path.suffix.lower() == ".parquet"
-
-
-# Layout of a CSV ---------------------------------------------------------------------------------------------------
 
 
 class CsvLayout(NamedTuple):

@@ -140,9 +140,6 @@ def from_json(content: Mapping[str, Any]) -> Diagnostic:
     return Diagnostic(content["code"], Severity(content["severity"]), place, value, limit, facts)
 
 
-# Numbers --------------------------------------------------------------------------------------------------------------
-
-
 # Unit → factor from SI, name with the space before it, and least number of significant digits.
 _UNITS = {
     "deg": (180.0 / math.pi, "°", 2),

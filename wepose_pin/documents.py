@@ -25,8 +25,6 @@ from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
 
 R = TypeVar("R")
 
-# Reading -----------------------------------------------------------------------------------------------------------
-
 
 def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> dict[str, Any]:
     """Read a TOML file; `what` names the expected contents in an error's text.
@@ -37,19 +35,11 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
         state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
         raise MissingFile(f"{path}: {state}; {what} is wanted here")
     try:
-        return parse_toml(path.read_bytes().decode("utf-8-sig"))
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # some editors write a byte-order mark
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read: {failure.strerror}") from failure
     except ValueError as failure:
         raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}; {what} is wanted here") from failure
-
-
-def parse_toml(text: str) -> dict[str, Any]:
-    """Parse a TOML text; any error is a ValueError."""
-    try:
-        return tomllib.loads(text.removeprefix("\ufeff"))  # some editors write a byte-order mark
-    except RecursionError:
-        raise ValueError("tables or lists within each other to no end") from None
 
 
 @dataclass(frozen=True)
@@ -134,11 +124,11 @@ class TomlTable:
     def names(self, key: str, count: int) -> list[str]:
         """Return a list of `count` different names of columns."""
         value = self.values.get(key)
-        names = [name for name in value if isinstance(name, str)] if isinstance(value, list) else []
-        if names != value or len(names) != count or len(set(names)) < count:
+        names = {name for name in value if isinstance(name, str)} if isinstance(value, list) else {}
+        if not isinstance(value, list) or not len(value) == len(names) == count:
             state = "is missing" if value is None else f"= {value!r}"
             raise self.error(f"{self.at(key)} {state}; a list of {count} different column names is needed")
-        return names
+        return value
 
 
 _FINITE = Annotated[float, Range(-1e300, closed=True, high=1e300)]
@@ -147,9 +137,6 @@ _FINITE = Annotated[float, Range(-1e300, closed=True, high=1e300)]
 def is_number(value: Any, below: float = 1e300) -> TypeGuard[float]:
     """Return whether a value is a finite int or float smaller than `below`, and no boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < below
-
-
-# Writing -----------------------------------------------------------------------------------------------------------
 
 
 def toml_string(text: str) -> str:
@@ -207,7 +194,6 @@ class Key:
     of: str = ""  # what texts name; `read_record` is given the names that there are
     words: Mapping[str, Any] = field(default_factory=dict, hash=False)  # text in the file → value of the field
     each: tuple[str, ...] = ()  # the keys of an array's numbers
-    unread: tuple[str, ...] = ()  # keys beside those, in tables of arrays, written for whoever looks at the file
     digits: int | None = None  # decimals that are written; None: all that count
 
     @property
@@ -265,8 +251,6 @@ def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Colle
     if get_origin(hint) is Mapping:
         entries, values = table.table(key.name), dict(base or {})
         for name in entries.values:
-            if key.each:
-                entries.table(name).allow(*key.each, *key.unread)
             own = entries.table(name) if key.each else entries
             values[name] = _read_value(parts[1], own, replace(key, name=name), known, values.get(name))
         return values

@@ -116,9 +116,6 @@ def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
     return fitted
 
 
-# Exactly ----------------------------------------------------------------------------------------------------------
-
-
 class _ExactChain:
     """The joints from the measured segment A above, or W, to a segment L; the spherical one nearest to L is free.
 
@@ -196,9 +193,6 @@ def _unwrap_signs(q, at, before):  # type: ignore[no-untyped-def]
                 for j in range(k, k + 4):
                     q[i, j] = -q[i, j]
             a, b, c, d = q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3]
-
-
-# As near as they come ---------------------------------------------------------------------------------------------
 
 
 class _Fit:

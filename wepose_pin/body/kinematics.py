@@ -115,9 +115,6 @@ def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
     return slice(first, last)
 
 
-# The table of a pose -----------------------------------------------------------------------------------------------
-
-
 def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
     """Build the table of ``pose.parquet``.
 
@@ -180,9 +177,6 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     )
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
     return Pose(time, quat_WL, points, segment_cov=segment_cov, point_cov=point_cov, gap=gap)
-
-
-# From orientations --------------------------------------------------------------------------------------------------
 
 
 def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:

@@ -83,9 +83,6 @@ def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str 
     return segment
 
 
-# Which follow from orientations -----------------------------------------------------------------------------------
-
-
 def find_known_points(model: BodyModel, segments: Iterable[str]) -> list[str]:
     """Find the points that follow from the measured segments: those that no open motion moves."""
     moved = _find_open_motions(model, list(segments), list(model.point_frames.values()))[1][:, :3]
@@ -152,9 +149,6 @@ def find_columns(m: pin.Model, joints: Iterable[int]) -> np.ndarray:
 def compute_joint_values(m: pin.Model, q: np.ndarray) -> dict[str, np.ndarray]:
     """Compute joint → its value (n,) [rad or m] in configurations (n, nq); only joints of one axis."""
     return {m.names[joint]: q[:, m.idx_qs[joint]].copy() for joint in range(1, m.njoints) if m.nqs[joint] == 1}
-
-
-# How well points are known -------------------------------------------------------------------------------------------
 
 
 def compute_point_covariances(

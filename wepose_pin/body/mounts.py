@@ -39,9 +39,6 @@ SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in mo
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
 
 
-# The start pose ----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StartPose:
     """The links of a body in the start pose, where the frame L' of each equals W."""
@@ -115,9 +112,6 @@ def compute_start_configuration(
     return q
 
 
-# Mounts before alignment, and their covariance ----------------------------------------------------------------------
-
-
 def collect_nominal_mounts(
     recording: Recording, subject: Subject | None, start_pose: StartPose
 ) -> dict[str, np.ndarray]:
@@ -176,9 +170,6 @@ def compute_start_heading_var(
         return 0.0
     is_calibrated = find_mount_covariance(recording, segment, subject) is not None
     return float(start_pose.std(segment, again=is_calibrated)[2] ** 2)
-
-
-# Alignment ---------------------------------------------------------------------------------------------------------
 
 
 def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:

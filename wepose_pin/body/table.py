@@ -6,7 +6,7 @@ Outside simulation and joint angles no module names a segment, a point or a leng
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -207,8 +207,7 @@ class BodyTable:
 
     def find_length(self, *points: str) -> str | None:
         """Return the name of the length between these points, or their middles; None: there is none."""
-        names = (name for name, length in self.lengths.items() if {*length.start, *length.end} == set(points))
-        return next(names, None)
+        return next((name for name, each in self.lengths.items() if {*each.start, *each.end} == set(points)), None)
 
     def find_limb(self, point: str) -> Limb | None:
         """Return the limb up to a point; None where the point is on none, or is the first one of its limb.
@@ -223,8 +222,7 @@ class BodyTable:
         between = {(*length.start, *length.end): length.segment for length in self.lengths.values()}
         own = dict.fromkeys(between[ends] for ends in pairwise(points) if ends in between)
         above = (segment for ends, segment in between.items() if points[0] in ends and segment not in own)
-        origin = [point for point in (points[0], self.counterpart(points[0])) if point is not None]
-        origin = sorted(origin, key=lambda name: name not in self.pairs)
+        origin = sorted({points[0], self.counterpart(points[0]) or points[0]}, key=lambda name: name not in self.pairs)
         return Limb(points, tuple(own), next(above, None), tuple(origin))
 
     @property
@@ -256,38 +254,29 @@ class BodyTable:
 
 def prune_table(table: BodyTable) -> BodyTable:
     """Return the table without what needs segments or points that it lacks."""
-    segments, points = dict(table.segments), {*table.points, ROOT}
+    segments, known = dict(table.segments), {*table.segments, *table.points, ROOT}
     for name, segment in table.segments.items():
         tissue = segment.soft_tissue
         tissue = tissue._replace(raised=tuple(other for other in tissue.raised if other in segments))
         if tissue.relative_to and tissue.relative_to not in segments:
             tissue = tissue._replace(relative_to="", per_tilt=ZERO, per_twist=0.0)
         segments[name] = segment._replace(soft_tissue=tissue)
+
+    def complete(parts: Mapping[str, Any], needs: Callable[[str, Any], Iterable[str]]) -> dict[str, Any]:
+        return {name: part for name, part in parts.items() if known.issuperset(needs(name, part))}
+
+    limbs = tuple(limb for limb in table.draw.limbs if known.issuperset(limb))
     pruned = replace(
         table,
         segments=segments,
-        lengths={
-            name: length
-            for name, length in table.lengths.items()
-            if length.segment in segments and points.issuperset(length.start + length.end)
-        },
-        hinges={name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= set(segments)},
-        girdles={
-            name: girdle
-            for name, girdle in table.girdles.items()
-            if name in points and {girdle.on, girdle.moves} <= set(segments)
-        },
-        sensors={name: place for name, place in table.sensors.items() if name in segments},
-        draw=Drawing(
-            tuple(limb for limb in table.draw.limbs if points.issuperset(limb)),
-            tuple(point for point in table.draw.paths if point in points),
-        ),
+        lengths=complete(table.lengths, lambda _, length: (length.segment, *length.start, *length.end)),
+        hinges=complete(table.hinges, lambda _, hinge: (hinge.on, hinge.moves)),
+        girdles=complete(table.girdles, lambda point, girdle: (point, girdle.on, girdle.moves)),
+        sensors=complete(table.sensors, lambda segment, _: (segment,)),
+        draw=Drawing(limbs, tuple(point for point in table.draw.paths if point in known)),
     )
-    names = {*segments, *points, *pruned.lengths, *pruned.hinges}
-    return replace(pruned, pairs={left: right for left, right in table.pairs.items() if {left, right} <= names})
-
-
-# The file ------------------------------------------------------------------------------------------------------------
+    known |= {*pruned.lengths, *pruned.hinges}
+    return replace(pruned, pairs=complete(table.pairs, lambda left, right: (left, right)))
 
 
 MODEL_TABLE = "model.toml"
@@ -369,7 +358,7 @@ def _normalise_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
 
 
 def _check_table(table: BodyTable, top: TomlTable) -> None:
-    """Raise `BadModel` on names that the table does not know, parallel axes, and labels that are no expression."""
+    """Raise `BadModel` on names that the table does not know, and on parallel axes."""
     names = (*table.segments, *table.points, *table.lengths, *table.hinges)
     for key, used, known in (
         ("girdles", table.girdles, table.points),
@@ -384,13 +373,9 @@ def _check_table(table: BodyTable, top: TomlTable) -> None:
         raise BadModel(f'{top.at("draw.limbs")}: lists of points are wanted, as [["hip", "knee", "ankle"]]')
     read_axes(top, table.up, table.forward)
     for name, segment in table.segments.items():
-        place = f"segments.{name}."
         if segment.up is not None or segment.forward is not None:
-            read_axes(replace(top, values={"up": segment.up, "forward": segment.forward}, place=place))
-        try:
-            re.compile(segment.labels)
-        except re.error as error:
-            raise BadModel(f"{top.at(place)}labels = {segment.labels!r} is no regular expression: {error}") from None
+            axes = {"up": segment.up, "forward": segment.forward}
+            read_axes(replace(top, values=axes, place=f"segments.{name}."))
 
 
 def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:

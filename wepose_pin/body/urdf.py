@@ -48,37 +48,30 @@ def read_urdf(path: Path) -> Any:
     return robot
 
 
-# The library -------------------------------------------------------------------------------------------------------
-
-
 class _LateTrimesh(ModuleType):
-    """In place of trimesh in yourdfpy: its names are those of trimesh, which is imported when one is used."""
+    """In place of trimesh while yourdfpy is imported: its names are objects, in annotations; later those of trimesh."""
 
     in_use = False
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return getattr(importlib.import_module(_TRIMESH), name) if self.in_use else object  # in an annotation
+        return getattr(importlib.import_module(_TRIMESH), name) if self.in_use else object
 
 
 def import_yourdfpy() -> Any:
-    """Import yourdfpy; trimesh is imported once its scenes are used."""
+    """Import yourdfpy; trimesh, which takes half a second, is imported once its scenes are used."""
     spec = importlib.util.find_spec(_TRIMESH)
     if "yourdfpy" in sys.modules or _TRIMESH in sys.modules or spec is None:
         return importlib.import_module("yourdfpy")
-    late = _LateTrimesh(_TRIMESH)
+    late = sys.modules[_TRIMESH] = _LateTrimesh(_TRIMESH)
     late.__path__ = list(spec.submodule_search_locations or ())  # of trimesh.transformations, which needs NumPy alone
-    sys.modules[_TRIMESH] = late
     try:
         return importlib.import_module("yourdfpy")
     finally:
         for name in [name for name in sys.modules if name.split(".")[0] == _TRIMESH]:
             del sys.modules[name]
         late.in_use = True
-
-
-# Meshes ------------------------------------------------------------------------------------------------------------
 
 
 def package_folders(urdf: Path) -> list[str]:
@@ -117,9 +110,6 @@ def find_example_data() -> Path | None:
     return None
 
 
-# What is drawn -------------------------------------------------------------------------------------------------------
-
-
 MAX_TRIANGLES = 30_000  # of a whole robot
 FINEST_CELL, CELL_GROWTH = 0.003, 1.4  # [m] size of the cells in which vertices are merged; factor until they suffice
 
@@ -139,32 +129,31 @@ class Visual(NamedTuple):
 
 
 def list_visuals(robot: Any) -> list[Visual]:
-    """The visuals of all links that have a geometry."""
+    """List the visuals of all links that have a geometry."""
     colours = {m.name: m.color.rgba for m in robot.materials if m.color is not None}
-    shapes = []
-    for link in robot.links:
-        for visual in link.visuals:
-            geometry, origin = visual.geometry, np.eye(4) if visual.origin is None else visual.origin
-            if geometry.box is not None:
-                kind, size = "box", geometry.box.size
-            elif geometry.cylinder is not None:
-                kind, size = "cylinder", (geometry.cylinder.radius, geometry.cylinder.length)
-            elif geometry.sphere is not None:
-                kind, size = "sphere", (geometry.sphere.radius,)
-            elif geometry.mesh is not None:
-                kind, size = "mesh", np.ones(3) if geometry.mesh.scale is None else geometry.mesh.scale * np.ones(3)
-            else:
-                continue
-            file = geometry.mesh.filename if kind == "mesh" else None
-            rgba = np.array([0.7, 0.7, 0.7, 1.0])
-            if visual.material is not None:
-                own = visual.material.color
-                rgba = own.rgba if own is not None else colours.get(visual.material.name, rgba)
-            r, g, b, a = (float(v) for v in rgba)
-            quat = Rotation.from_matrix(origin[:3, :3]).as_quat()
-            sizes = tuple(float(v) for v in size)
-            shapes.append(Visual(link.name, kind, sizes, quat, origin[:3, 3].copy(), (r, g, b, a), file))
-    return shapes
+    visuals = []
+    for name, visual in ((link.name, visual) for link in robot.links for visual in link.visuals):
+        box, cylinder, sphere, mesh = (getattr(visual.geometry, kind) for kind in ("box", "cylinder", "sphere", "mesh"))
+        if box is not None:
+            kind, size = "box", box.size
+        elif cylinder is not None:
+            kind, size = "cylinder", (cylinder.radius, cylinder.length)
+        elif sphere is not None:
+            kind, size = "sphere", (sphere.radius,)
+        elif mesh is not None:
+            kind, size = "mesh", np.ones(3) if mesh.scale is None else mesh.scale * np.ones(3)
+        else:
+            continue
+        rgba = (0.7, 0.7, 0.7, 1.0)
+        if visual.material is not None:
+            own = visual.material.color
+            rgba = own.rgba if own is not None else colours.get(visual.material.name, rgba)
+        r, g, b, a = (float(v) for v in rgba)
+        M = np.eye(4) if visual.origin is None else visual.origin
+        quat, sizes = Rotation.from_matrix(M[:3, :3]).as_quat(), tuple(float(v) for v in size)
+        file = mesh.filename if kind == "mesh" else None
+        visuals.append(Visual(name, kind, sizes, quat, M[:3, 3].copy(), (r, g, b, a), file))
+    return visuals
 
 
 def reduce_triangles(meshes: list[Mesh]) -> list[Mesh]:
@@ -183,10 +172,8 @@ def triangulate(geometry: Any) -> Mesh:
 
     kind = type(geometry).__name__
     if hasattr(geometry, "num_tris") and hasattr(geometry, "tri_indices"):
-        triangles = np.array(
-            [[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))], dtype=int
-        )
-        return np.asarray(geometry.vertices(), dtype=float), triangles.reshape(-1, 3)
+        triangles = [[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))]
+        return np.asarray(geometry.vertices(), dtype=float), np.array(triangles, dtype=int).reshape(-1, 3)
     if kind == "Box":
         mesh = trimesh.creation.box(2.0 * np.asarray(geometry.halfSide).ravel())
     elif kind == "Cylinder":

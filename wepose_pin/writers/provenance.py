@@ -10,6 +10,7 @@ import json
 import platform
 import shutil
 import subprocess
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -19,7 +20,7 @@ from typing import Any
 from .. import __version__
 from ..assets import asset
 from ..body.table import MODEL_TABLE
-from ..documents import parse_toml, whole_folder
+from ..documents import whole_folder
 from ..errors import ExistingOutput
 from ..libraries import check_file, library_errors
 from .result import JOINTS, versions
@@ -117,7 +118,7 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     if path.suffix != ".toml" or not path.is_file():  # a pipe would block
         return []
     try:
-        content = parse_toml(path.read_bytes().decode("utf-8"))
+        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except (OSError, ValueError):
         return []  # its reader reports what is wrong
     names = set()
