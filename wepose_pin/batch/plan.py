@@ -43,23 +43,14 @@ class Subject(NamedTuple):
 
 @dataclass(frozen=True)
 class Item:
-    """One session and its steps.
+    """One session and its steps."""
 
-    Parameters
-    ----------
-    name : of its folder, unique in the plan
-    session, subject_file : paths or URLs
-    subject : a name of the plan
-    steps : step → the options that the plan gives
-    person : the options of `calibrate` that are known of the person
-    """
-
-    name: str
-    session: str
-    steps: Mapping[str, Mapping[str, Any]]
-    subject: str | None = None
-    subject_file: str | None = None
-    person: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # of its folder, unique in the plan
+    session: str  # path or URL
+    steps: Mapping[str, Mapping[str, Any]]  # step → the options that the plan gives
+    subject: str | None = None  # a name of the plan
+    subject_file: str | None = None  # path or URL
+    person: Mapping[str, Any] = field(default_factory=dict)  # options of `calibrate`
 
 
 class Plan(NamedTuple):
@@ -70,13 +61,7 @@ class Plan(NamedTuple):
 
 
 def read_plan(path: Path, items_folder: str) -> Plan:
-    """Read a plan and find its sessions; `items_folder` will hold the items' folders.
-
-    Raises
-    ------
-    WeposeError
-        With one line that names the file, the key, the value found and what would be right.
-    """
+    """Read a plan and find its sessions; `items_folder` will hold the items' folders. A mistake is a `WeposeError`."""
     top = TomlTable(read_toml(path, "a plan", BadPlan), str(path), error=BadPlan)
     top.allow("sessions", "subjects", "steps")
     steps = _read_steps(top.table("steps"), path)

@@ -67,10 +67,7 @@ def write_bytes(url: str, content: bytes) -> None:
 def open_study(url: str) -> Iterator[None]:
     """Make the folder of a study, and hold it for this process; leftovers of killed runs are removed.
 
-    Raises
-    ------
-    ExistingOutput
-        It holds something else, cannot be made, or another run holds it.
+    `ExistingOutput`: it holds something else, cannot be made, or another run holds it.
     """
     if is_remote(url):
         yield

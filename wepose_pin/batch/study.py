@@ -49,14 +49,10 @@ def run_batch(
     force: bool = False,
     progress: ItemProgress = lambda *_: None,
 ) -> Study:
-    """Run all items of a plan and write ``results.parquet``, in a folder or below a URL.
+    """Run all items of a plan and write ``results.parquet``, in a folder or below a URL; options as those of `batch`.
 
-    Items that were done before are reused where nothing has changed. Options as those of `batch`.
-
-    Raises
-    ------
-    WeposeError
-        Of the plan or the place. The errors of an item are in its row.
+    Items that were done before are reused where nothing has changed. A mistake in the plan or the place is a
+    `WeposeError`; the errors of an item are in its row.
     """
     if workers is not None and scheduler is not None:
         raise BadOption(f"--workers {workers}: leave it out; the workers of --scheduler are running already")

@@ -116,5 +116,5 @@ def angles(
     sequence = movements[0].sequence
     by = f"; shoulder {'-'.join(sequence)}{', chosen by gimbal lock' if shoulder == 'auto' else ''}" if sequence else ""
     say(f"Orientations {filtered}{by}")
-    say_pages(out, {"Page": PAGE})
+    say_pages(out)
     say(f"Tables and figures: {out}")

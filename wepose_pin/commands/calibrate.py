@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ..diagnostics import Diagnostic, lines
+from ..diagnostics import lines
 from ..errors import WrongOption
 from .options import (
     RESEARCH,
@@ -118,17 +118,15 @@ def calibrate(
                 formulation=formulation,
             )
             write_calibration(folder, calibration, collect_provenance("calibrate", options))
-        failures: list[Diagnostic] = []
-        if report:
-            progress("writing the report", 2 / 3)
-            failures = report_room.write_calibration_page(out, calibration, recording, method=method)
+        progress("writing the report", 2 / 3)
+        failures = report_room.write_calibration_page(out, calibration, recording, method=method, report=report)
     quality = calibration.quality
     print_diagnostics([*quality.further, *failures])
     print_table(*report_room.tabulate_lengths(calibration))
     print_table(*report_room.tabulate_mounts(calibration))
     if not math.isnan(calibration.rms_gap):  # a protocol without a closure
         say_paragraph(report_room.describe_gap(calibration))
-    say_pages(out, {"Report": "report.html"} if report else {})
+    say_pages(out)
     say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
     say(f"Quality: {quality.quality}")
     for _, line in lines(quality.reasons):

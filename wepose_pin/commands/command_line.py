@@ -30,10 +30,8 @@ _LABEL = 24  # columns of an option's name beside its text
 def parse(words: Sequence[str]) -> tuple[Callable[..., Any], inspect.BoundArguments]:
     """The command that these words name, and its arguments; ``--help`` and ``--version`` are commands too.
 
-    Raises
-    ------
-    BadOption
-        A command or an option that is not known, lacks its value or has one that is not possible, or is missing.
+    `BadOption`: a command or an option that is not known, lacks its value or has one that is not possible, or is
+    missing.
     """
     first = words[0] if words else ""
     if first and first not in (*COMMANDS, *HELP, *VERSION):

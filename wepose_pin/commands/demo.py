@@ -72,5 +72,5 @@ def demo(*, out: Out = Path("wepose-demo"), seed: Seed = 1, force: Force = False
         f"shoulders, {from_root.mean:.1f} ± {from_root.std:.1f} mm from the hips"
     )
     print_diagnostics(failures)
-    say_pages(out / "result", {"Motion": "view.html"})
+    say_pages(out / "result")
     say(f"Session, subject, result, numbers:  {out}/session  {out}/subject  {out}/result  {out}/demo.json")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,9 +40,9 @@ def print_diagnostics(diagnostics: Iterable[Diagnostic]) -> None:
         print(f"{severity}: {_shown(line)}", file=sys.stderr)
 
 
-def say_pages(folder: Path, pages: Mapping[str, str]) -> None:
-    """What each page is and where it lies; nothing of those that could not be made."""
-    for title, name in pages.items():
+def say_pages(folder: Path) -> None:
+    """What each page of a result is and where it lies."""
+    for title, name in (("Report", "report.html"), ("Page", "angles.html"), ("Motion", "view.html")):
         if (folder / name).is_file():
             say(f"{title}:  {folder / name}")
 

@@ -123,14 +123,14 @@ def retarget(
             page = make_view() if view else None
             return report_room.render_retargeting_report(trajectory, summary, title=title, view=page)
 
-        pages = ({"view.html": make_view} if view else {}) | ({"report.html": make_report} if report else {})
+        pages = {"view.html": make_view if view else None, "report.html": make_report if report else None}
         failures = write_pages(out, pages)
     print_diagnostics([*map(from_json, summary["diagnostics"]), *failures])
     for table in (report_room.tabulate_run(summary), *report_room.tabulate_hands(summary)):
         print_table(*table)
     say_paragraph(report_room.describe_reliance(trajectory, summary))
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
-    say_pages(out, ({"Report": "report.html"} if report else {}) | ({"Motion": "view.html"} if view else {}))
+    say_pages(out)
     runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]
     return Outcome(summary, 0 if runnable else 3)
 

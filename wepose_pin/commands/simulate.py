@@ -126,13 +126,11 @@ def choose_imperfections(preset: str, changes: Mapping[str, float | str]) -> Imp
 
     from ..simulation import PRESETS
 
-    sizes = PRESETS[preset]
-    names = [each.name for each in fields(sizes)]
-    for name, value in changes.items():
+    names = [each.name for each in fields(PRESETS[preset])]
+    for name in changes:
         if name not in names:
             raise BadOption(f"--imperfection {name}: not an imperfection; {one_of(names, name, len(names))}")
-        try:
-            sizes = replace(sizes, **dict[str, Any]({name: value}))
-        except BadOption as error:
-            raise BadOption(f"--imperfection {name}={value}: {error}") from None
-    return sizes
+    try:
+        return replace(PRESETS[preset], **dict[str, Any](changes))
+    except BadOption as error:
+        raise BadOption(f"--imperfection: {error}") from None

@@ -124,7 +124,7 @@ def track(
     print_diagnostics(from_json(each) for each in content["diagnostics"])
     _print_sensors(content)
     print_diagnostics(failures)
-    say_pages(out, ({"Report": "report.html"} if report else {}) | ({"Motion": "view.html"} if view else {}))
+    say_pages(out)
     say(f"Pose: {out / 'pose.parquet'}  ({len(content['sensors'])} segments, {len(content['points'])} points)")
     if "joints" in content:
         say(f"Joints: {out / 'joints.parquet'}")

@@ -29,7 +29,7 @@ QUALITIES = {
 
 
 def write_calibration_page(
-    folder: Path, calibration: Calibration, recording: Recording, *, method: str
+    folder: Path, calibration: Calibration, recording: Recording, *, method: str, report: bool = True
 ) -> list[Diagnostic]:
     """Write ``report.html`` beside a calibration's result, as `write_pages`; `method`: as the calibration was run."""
 
@@ -41,7 +41,7 @@ def write_calibration_page(
             )
         return render_calibration_report(calibration, recording, tracked=tracked, method=method)
 
-    return write_pages(folder, {"report.html": make})
+    return write_pages(folder, {"report.html": make if report else None})
 
 
 def render_calibration_report(

@@ -91,15 +91,17 @@ def inline(text: str) -> Markup:
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", marked))
 
 
-def write_pages(folder: Path, pages: Mapping[str, Callable[[], str]]) -> list[Diagnostic]:
+def write_pages(folder: Path, pages: Mapping[str, Callable[[], str] | None]) -> list[Diagnostic]:
     """Write pages beside a result, each whole or not at all; return a diagnostic for each that cannot be made.
 
-    `pages`: file name → what makes its text. Pages of an earlier result are removed first.
+    `pages`: file name → what makes its text; None: it is not made. Pages of an earlier result are removed first.
     """
     for name in pages:
         (folder / name).unlink(missing_ok=True)
     diagnostics = []
     for name, make in pages.items():
+        if make is None:
+            continue
         try:
             text = make()
             with whole_file(folder / name) as partial:

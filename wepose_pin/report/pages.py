@@ -6,7 +6,6 @@ import shutil
 import sys
 import tempfile
 import webbrowser
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -39,8 +38,9 @@ def write_track_pages(
 
         return render_track_report(summary, view=make_view() if view else None)
 
-    pages: dict[str, Callable[[], str]] = {"view.html": make_view} if view else {}
-    return write_pages(folder, pages | ({"report.html": make_report} if report else {}))
+    return write_pages(
+        folder, {"view.html": make_view if view else None, "report.html": make_report if report else None}
+    )
 
 
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:
