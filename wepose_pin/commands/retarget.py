@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from ..diagnostics import from_json
 from .options import MORE, Arms, Factor, Force, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
 from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
-
-if TYPE_CHECKING:
-    from ..body.kinematics import Pose
-    from ..retargeting import Trajectory
 
 
 def retarget(
@@ -74,8 +70,11 @@ def retarget(
     """
     options = dict(locals())
     import json
+    from dataclasses import replace
 
     from .. import retargeting
+    from ..angles import joint_angles
+    from ..angles.repetitions import find_repetitions
     from ..documents import whole_folder
     from ..report import retargeting as report_room
     from ..report.page import write_pages
@@ -104,11 +103,19 @@ def retarget(
             progress("writing", 0.98)
             retargeting.write_trajectory(folder, trajectory)
             name = str(about.get("recording") or result.name)
+            sides = tuple(arm.side for arm in trajectory.robot.arms)
+            angles = joint_angles(pose)
+            own = {joint: each for joint, each in angles.joints.items() if joint.startswith(sides)}
+            repetitions = find_repetitions(replace(angles, joints=own))
             summary = as_json(retargeting.summarize(trajectory, check, collisions))
             summary |= {
                 "recording": name,
                 "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
-                REPETITIONS: _find_repetitions(pose, trajectory),
+                REPETITIONS: {
+                    "source": repetitions.source,
+                    "spans": repetitions.spans.tolist(),
+                    "reason": repetitions.reason,
+                },
             }
             text = json.dumps({**summary, "provenance": collect_provenance("retarget", options)}, indent=2)
             (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
@@ -133,17 +140,3 @@ def retarget(
     say_pages(out)
     runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]
     return Outcome(summary, 0 if runnable else 3)
-
-
-def _find_repetitions(pose: Pose, trajectory: Trajectory) -> dict[str, Any]:
-    """The repetitions of the arms that a robot follows, as `wepose angles` finds them: by which angle, when [s]."""
-    from dataclasses import replace
-
-    from ..angles import joint_angles
-    from ..angles.repetitions import find_repetitions
-
-    angles = joint_angles(pose)
-    sides = tuple(arm.side for arm in trajectory.robot.arms)
-    of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
-    repetitions = find_repetitions(replace(angles, joints=of_arms))
-    return {"source": repetitions.source, "spans": repetitions.spans.tolist(), "reason": repetitions.reason}

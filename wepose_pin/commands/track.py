@@ -135,14 +135,13 @@ def track(
 
 def _print_sensors(summary: Mapping[str, Any]) -> None:
     """Print the sensors' static share, bias and gravity."""
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for segment, about in summary["sensors"].items():
-        if "static_share" not in about:
-            rows.append((segment, "", "orientations from the recording", ""))
-            continue
-        begin, end = (math.hypot(*about[f"gyro_bias_{when}_deg_s"]) for when in ("start", "end"))
-        share, gravity = f"{100 * about['static_share']:.0f} %", f"{about['gravity_m_s2']:.3f}"
-        rows.append((segment, share, f"{begin:.3f} → {end:.3f}", gravity))
+        row = [segment, "", "orientations from the recording", ""]
+        if "static_share" in about:
+            begin, end = (math.hypot(*about[f"gyro_bias_{when}_deg_s"]) for when in ("start", "end"))
+            row[1:] = f"{100 * about['static_share']:.0f} %", f"{begin:.3f} → {end:.3f}", f"{about['gravity_m_s2']:.3f}"
+        rows.append(row)
     print_table(
         f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {summary['method']}, "
         f"lengths: {summary['subject']['note'] or summary['subject']['name']}",

@@ -82,10 +82,11 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
 
 def explain_missing(movements: Sequence[Movement]) -> list[str]:
     """Why a session has no repetitions, of those that have none, and what to do."""
-    missing = [(each.name, each.repetitions) for each in movements if each.repetitions.reason]
     return [
-        f"{name}: no repetitions{f' by {found.source}' if found.source else ''}: {found.reason}. {ADVICE}"
-        for name, found in missing
+        f"{each.name}: no repetitions{f' by {source}' if (source := each.repetitions.source) else ''}: "
+        f"{each.repetitions.reason}. {ADVICE}"
+        for each in movements
+        if each.repetitions.reason
     ]
 
 
