@@ -67,8 +67,8 @@ def _run(item: Item, target: str, force: bool) -> Row:
             with_truth = name == "session" and "evaluate" in item.steps  # the reference that it names
             local[name] = fetch(url, Path(fetched), with_truth)
             hashes[f"input {name}"] = file_hashes(local[name], with_truth)
-        options = [list(item.steps.items()), item.person]
-        key = json.loads(json.dumps({"code": code()["code"], "options": options, **hashes}))
+        chosen = [list(item.steps.items()), item.person]
+        key = json.loads(json.dumps({"code": code()["code"], "options": chosen, **hashes}))
         done: Any = None
         with contextlib.suppress(ValueError):  # a damaged file is none
             done = json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
