@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import Pose, WeposeError, joint_angles
-from wepose_pin.angles import summary
 
 ARM = ("upper_arm", "forearm", "hand")
 LEG = ("thigh", "shank", "foot")
@@ -365,40 +364,3 @@ def test_the_sequence_that_is_chosen_is_determined_while_arms_hang(abducted_deg:
     angles = joint_angles(pose_with({"torso": np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), **arms}), "auto")
     assert {angles[name].sequence for name in ("left_shoulder", "right_shoulder")} == {sequence}
     assert not angles["left_shoulder"].near_lock.any()
-
-
-# Ranges, rates, tables --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rate_hz", [40.0, 400.0])
-def test_range_and_peak_rate_of_a_swing_are_its_closed_form(rate_hz: float) -> None:
-    frequency, reach = 0.77, np.radians(50.0)  # no whole number of samples, so that one of them is near the peak
-    t = np.arange(0.0, 20.0, 1.0 / rate_hz)
-    flexion = np.radians(70.0) + reach * np.sin(2.0 * np.pi * frequency * t)
-    forearm = Rotation.from_rotvec(np.outer(flexion, [0.0, -1.0, 0.0])).as_quat()
-    torso = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
-    pose = Pose(t, {"torso": torso, "right_upper_arm": torso, "right_forearm": forearm}, {})
-    joint_summary = summary(joint_angles(pose))["right_elbow"]
-    peak = 2.0 * np.pi * frequency * reach
-    np.testing.assert_allclose(np.degrees(joint_summary.range), [100.0, 0.0, 0.0], atol=0.02)
-    np.testing.assert_allclose(
-        np.degrees([joint_summary.lowest[0], joint_summary.highest[0]]), [20.0, 120.0], atol=0.02
-    )
-    assert joint_summary.peak_rate[0] == pytest.approx(peak, rel=0.02)
-    assert (joint_summary.near_lock, joint_summary.gap) == (0.0, 0.0)
-
-
-def test_near_the_lock_no_angle_makes_a_range_or_a_rate() -> None:
-    n = 400
-    rng = np.random.default_rng(6)
-    hanging = Rotation.from_rotvec(0.003 * rng.normal(size=(n, 3)))
-    raised = Rotation.from_euler(
-        "YXY", np.column_stack([np.full(n, 0.3), np.linspace(-0.2, -1.2, n), np.full(n, -0.3)])
-    )
-    angles = joint_angles(pose_with(arm_of("left", Rotation.concatenate([hanging, raised]).as_matrix())))
-    joint_summary = summary(angles)["left_shoulder"]
-    assert np.ptp(angles["left_shoulder"].values[:n, 0]) > 1.0  # it spins
-    np.testing.assert_allclose(joint_summary.range[[0, 2]], 0.0, atol=1e-9)
-    np.testing.assert_allclose(joint_summary.peak_rate, [0.0, 100.0 / (n - 1), 0.0], atol=1e-6)
-    assert joint_summary.near_lock == pytest.approx(0.5)
-    assert joint_summary.highest[1] == pytest.approx(0.0, abs=0.02)

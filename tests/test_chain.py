@@ -254,25 +254,6 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     np.testing.assert_allclose(reach, 0.5, atol=1e-9)
 
 
-def test_a_joint_that_slides_stays_where_it_is(urdf: Path, tmp_path: Path) -> None:
-    """Orientations do not tell of it: it is undetermined, and what it moves is not written."""
-    slider = (
-        '<link name="rod"/><joint name="slider" type="prismatic"><parent link="wrist_1_link"/><child link="rod"/>'
-        '<axis xyz="1 0 0"/><limit lower="0" upper="0.5" effort="1" velocity="1"/></joint></robot>'
-    )
-    text = urdf.read_text(encoding="utf-8").replace("</robot>", slider)
-    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
-    table = TABLE.replace("[lengths]", 'rod = "rod"\n[lengths]')
-    table = table.replace("[poses.home]", "[poses.home]\nslider = 0.2")
-    (tmp_path / "arm.toml").write_text(table, encoding="utf-8")
-    recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)
-    subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
-    tracked = track(replace(as_segments(recording), model=str(tmp_path / "arm.toml")), subject)
-    assert tracked.find_undetermined_joints() == ["slider"]
-    assert set(tracked.points) == {"elbow", "wrist", "tip"}
-    np.testing.assert_allclose(tracked.joints["slider"], 0.2, atol=1e-9)
-
-
 def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:
     """A mount R_LS that was found holds from any start configuration; a stated one is of the start pose."""
     recording, _ = made(urdf, MARKED_WITH_SENSORS, 12.0)

@@ -140,27 +140,6 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     assert end[0] < 0.9 * end[1]
 
 
-def test_the_drift_that_all_sensors_may_share_is_in_the_torsos_heading() -> None:
-    """After a start pose of 0.6 s the biases are hardly known, and neighbours tell differences alone."""
-    person = simulate_person(4)
-    simulation = simulate(person.lengths, seed=4, clasp_s=40.0, circles=2)
-    recording = simulation.recording()
-    begin = recording.phases["start"][0][0]
-    recording = replace(recording, phases={"start": ((begin, begin + 0.6),)})
-    order = (*LENGTHS, *mount_rows("torso"))
-    covariance = np.zeros((len(order), len(order)))
-    covariance[:8, :8] = person.prior.covariance
-    covariance[8:, 8:] = np.deg2rad(4.0) ** 2 * np.eye(3)
-    subject = replace(person.prior, mounts=simulation.quat_LS, order=order, covariance=covariance, girdles=RIGID)
-    drift = {}
-    for open_loop in (True, False):
-        of_heading = track(recording, subject, open_loop=open_loop).pose.segment_cov["torso"][:, 2, 2]
-        drift[open_loop] = np.degrees(np.sqrt(np.ptp(of_heading)))
-    assert drift[True] > 4.0
-    # Five sensors share what they know of the drift that is common to them.
-    assert 0.3 * drift[True] < drift[False] < 1.2 * drift[True]
-
-
 def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simulation, Subject]) -> None:
     """What the filters have corrected up to there is that of the next chunk's first sample, as in the whole."""
     recording = made[0].recording()

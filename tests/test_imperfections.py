@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 from simulated import SEGMENTS, SUBJECT, G
 
 from wepose_pin import (
@@ -94,28 +92,6 @@ def test_quantisation_and_range() -> None:
             expected = np.clip(getattr(clean, name)[segment], -limit, limit)
             assert np.array_equal(getattr(cut, name)[segment], expected)
     assert np.sum(np.abs(cut.gyro_S["left_forearm"]) == np.deg2rad(90.0)) > 10
-
-
-def test_clocks_shift_the_samples_in_the_data() -> None:
-    options = {"seed": 2, "noise": NOISE_FREE, "clasp_s": 10.0, "circles": 1, "rate_hz": 200.0}
-    clean = simulate(SUBJECT, **options)
-    sizes = Imperfections(clock_jitter=2e-4, clock_offset=5e-3)
-    sim = simulate(SUBJECT, imperfections=sizes, **options)
-    offsets = []
-    for segment in SEGMENTS:
-        late = sim.sample_time[segment] - sim.time
-        offsets.append(late.mean())
-        assert late.std() == pytest.approx(2e-4, rel=0.1)
-        expected = CubicSpline(clean.time, clean.accel_S[segment])(sim.sample_time[segment])
-        assert np.abs(sim.accel_S[segment] - expected)[20:-20].max() < 5e-3
-        # a rate times the time that it was measured over is the rotation
-        R_WS = Rotation.from_quat(sim.quat_WS[segment])
-        turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(sim.sample_time[segment])[:, None]
-        np.testing.assert_allclose(sim.gyro_S[segment][1:], turned, atol=1e-12)
-    assert np.ptp(offsets) > 2e-3
-    recorded = sim.recording()
-    assert np.array_equal(recorded.time, sim.time)
-    assert np.array_equal(recorded.sensors["torso"].gyro_S, sim.gyro_S["torso"])
 
 
 def test_lost_samples_are_bridged_as_in_a_users_file(people: Simulation, tmp_path: Path) -> None:

@@ -117,18 +117,6 @@ def test_the_outcome_holds_lengths_and_says_what_its_deviations_lack(estimated: 
     assert 1.0 < estimated.effective_sample_size < 12.1  # 36 s of errors that last 3 s and more
 
 
-def test_exact_orientations_give_the_lengths_back() -> None:
-    person = simulate_person(11)
-    simulation = simulate(person.lengths, seed=11, noise=wp.NOISE_FREE, clasp_s=20.0, circles=0)
-    sensors = {name: OrientationSensor(quat_VS=quat) for name, quat in simulation.quat_WL.items()}
-    recording = replace(simulation.recording("exact"), sensors=sensors)
-    measured = {name: person.lengths[name] for name in ("left_upper_arm", "left_hand", "right_forearm")}
-    calibration = calibrate(recording, measured=measured, formulation="paper")
-    for name in ("shoulder_width", *(n for n in LENGTHS if "arm" in n or "hand" in n)):
-        assert calibration.subject.lengths[name] == pytest.approx(person.lengths[name], abs=1e-6), name
-    assert calibration.rms_gap < 1e-6
-
-
 def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulation, Recording]) -> None:
     person, _, recording = made
     calibration = calibrate(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
@@ -183,24 +171,6 @@ def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> N
             measured={"shoulder_width": 0.38},
             formulation="paper",
         )
-
-
-# Tracking -------------------------------------------------------------------------------------------------------------
-
-
-def test_open_loop_leaves_the_headings_as_the_filter_has_them(made: tuple[Person, Simulation, Recording]) -> None:
-    person, simulation, recording = made
-    subject = replace(person.prior, lengths=person.lengths, mounts=simulation.quat_LS)
-    corrected, free, causal = (
-        track(recording, subject, **options)
-        for options in ({}, {"open_loop": True}, {"causal": True, "open_loop": True})
-    )
-    assert corrected.correction is not None
-    assert free.correction is None
-    # Uncorrected as a live session is, but for its start half a second later.
-    for name, quat in causal.quat_WL.items():
-        offline = Rotation.from_quat(free.quat_WL[name][-len(quat) :])
-        assert np.degrees((offline.inv() * Rotation.from_quat(quat)).magnitude().max()) < 0.5
 
 
 # Commands -------------------------------------------------------------------------------------------------------------

@@ -86,13 +86,6 @@ def test_an_angle_that_rests_high_falls_first() -> None:
         check_spans(repetitions, spans)
 
 
-def test_without_a_rest_the_end_nearer_to_zero_begins() -> None:
-    signal = np.concatenate([reach(2.0)] * 6)
-    assert find(signal).rising is True
-    assert find(-signal).rising is False
-    assert len(find(signal, rising=False).spans) == 5  # from peak to peak
-
-
 def test_other_movements_between_are_left_out() -> None:
     """Standing up, say: an excursion far larger than those that repeat, a small one, and one with a long stop in it."""
     stop = np.concatenate([reach(1.5)[:75], rest(6.0, 88.0), reach(1.5)[75:]])
@@ -134,16 +127,6 @@ def test_a_motion_at_random_is_hardly_ever_taken_for_repetitions() -> None:
         taken += not repetitions.reason
         assert repetitions.reason or repetitions.cmc >= 0.85
     assert taken <= 1
-
-
-def test_the_rate_of_sampling_does_not_matter() -> None:
-    for rate_hz in (25.0, 400.0):
-        signal = np.concatenate(
-            [rest(1.0, rate_hz=rate_hz), *[reach(2.0, rate_hz=rate_hz)] * 5, rest(1.0, rate_hz=rate_hz)]
-        )
-        repetitions = find_repetitions(angles_of(signal, rate_hz))
-        np.testing.assert_allclose(repetitions.spans[:, 0], 1.0 + 2.0 * np.arange(5), atol=0.081)
-        np.testing.assert_allclose(repetitions.spans[:, 1], 3.0 + 2.0 * np.arange(5), atol=0.081)
 
 
 # The main angle ---------------------------------------------------------------------------------------------------

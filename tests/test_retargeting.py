@@ -108,32 +108,6 @@ def test_it_begins_and_ends_at_rest_and_shows_the_recording_to_its_end(swung: re
     assert swung.recorded_time[-1] == pytest.approx(7.99, abs=0.02)
 
 
-@pytest.mark.slow
-def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
-    straight = retargeting.retarget(person(4.0), arm)
-    turned = retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
-    trajectory = retargeting.retarget(person(4.0), turned)
-    assert np.abs(trajectory.joint_position - straight.joint_position).max() < 1e-6
-    # Said of the root's axes in place of the base's: y of the root is where z of the base points to −z, z up is +y.
-    (tmp_path / "root").mkdir()
-    by_root = retargeting.load_robot(
-        retargeting.find_map(str(write_arm(tmp_path / "root", turned=(0.5 * np.pi, 0.0, 0.0), base="", up="-y")))
-    )
-    assert np.abs(retargeting.retarget(person(4.0), by_root).joint_position - straight.joint_position).max() < 1e-6
-
-
-@pytest.mark.slow
-def test_a_joint_without_end_moves_and_one_that_is_copied_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "c").mkdir()
-    endless = retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path / "c", continuous="roll"))))
-    assert endless.model.nq == endless.model.nv + 1
-    trajectory = retargeting.retarget(person(4.0), endless)
-    is_sound(trajectory)
-    assert np.median(error(trajectory)) < 5e-3
-    with pytest.raises(errors.WeposeError, match="'elbow' is no joint of the arm: it is copied by 'elbow_copy'"):
-        retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path, mimic=True))))
-
-
 @pytest.mark.parametrize("only", ["position", "orientation"])
 def test_a_task_can_be_left_out(arm, only: str) -> None:
     other = {"position": "orientation", "orientation": "position"}[only]
@@ -268,12 +242,3 @@ def test_too_fast_is_slowed(tmp_path: Path) -> None:
     assert trajectory.time[-1] - trajectory.time[trajectory.approach_samples] > 1.3 * 4.0
     assert trajectory.limiting_joint is not None
     assert trajectory.limiting_joint.joint in JOINTS
-
-
-def test_the_same_motion_at_another_rate(arm) -> None:
-    trajectory = retargeting.retarget(person(3.0), arm, rate_hz=250.0)
-    is_sound(trajectory)
-    assert trajectory.time[1] == pytest.approx(0.004)
-    assert np.median(error(trajectory)) < 5e-3
-    with pytest.raises(errors.WeposeError, match="--rate-hz 5: from 10 to 2000"):
-        retargeting.retarget(person(), arm, rate_hz=5.0)

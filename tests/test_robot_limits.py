@@ -64,14 +64,6 @@ def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit(dt: fl
     assert (nearest < 1e-3).all()  # and the bounds do not hold it off the limit
 
 
-@pytest.mark.parametrize("dt", [pytest.param(0.002, marks=pytest.mark.slow), 0.01, 0.05])
-def test_a_joint_that_is_pushed_against_its_limit_lies_still_there(dt: float) -> None:
-    """Braking at full strength up to the limit would bounce off it: a brake cannot be let go at once."""
-    end = list(ridden(lambda _time, _rng, n: np.ones(n), dt, 25.0))[-round(1.0 / dt) :]
-    assert max(np.abs(v).max() for _, v, _ in end) < 1e-4
-    assert max(np.abs(a).max() for _, _, a in end) < 1e-3
-
-
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 def test_a_stop_keeps_the_limits_and_ends_at_rest(dt: float) -> None:
     """From states of joints that now rush to an end of what the bounds leave, now take any of it."""

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from arms import JOINTS, person, write_arm
+from arms import person, write_arm
 
 from wepose_pin import errors, retargeting
 from wepose_pin.body.kinematics import Pose
@@ -37,61 +34,6 @@ def load(urdf: Path) -> retargeting.Robot:
 def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, key: str, text: str) -> None:
     with pytest.raises(errors.WeposeError, match=text):
         load(write_arm(tmp_path, without=key))
-
-
-PAGE = (Path(__file__).parents[1] / "docs" / "robot-maps.md").read_text(encoding="utf-8")
-REQUIRED = {key: "**required**" in rest for key, rest in re.findall(r"(?m)^\| `([\w.]+)` \|.*?\|(.*?)\|", PAGE)}
-STATED = {
-    "format": "1",
-    "urdf": '"arm.urdf"',
-    "srdf": '"arm.srdf"',
-    "description": '"a test"',
-    "base": '"base"',
-    "up": '"+z"',
-    "forward": '"+x"',
-    "table": "-2.0",
-    "rest.JOINT": "-1.2",
-    "limits.source": '"nobody"',
-    "limits.acceleration": "12.0",
-    "limits.jerk": "600.0",
-    "limits.velocity": "2.0",
-    "limits.position.JOINT": "[-2.0, -0.1]",
-    "collision.LINK.xyz": "[0.0, 0.0, -0.2]",
-    "collision.LINK.rpy": "[0.0, 0.5, 0.0]",
-    "arms.SIDE.joints": json.dumps(JOINTS),
-    "arms.SIDE.shoulder.link": '"upper_arm"',
-    "arms.SIDE.shoulder.offset": "[0.0, 0.0, 0.0]",
-    "arms.SIDE.elbow.link": '"forearm"',
-    "arms.SIDE.elbow.offset": "[0.0, 0.0, 0.0]",
-    "arms.SIDE.hand.link": '"hand"',
-    "arms.SIDE.hand.offset": "[0.0, 0.0, -0.1]",
-    "arms.SIDE.hand.fingers": '"-z"',
-    "arms.SIDE.hand.thumb": '"+x"',
-    "arms.SIDE.reach": "0.6",
-}  # a map with every key
-
-
-@pytest.mark.parametrize("without", ["nothing", *STATED])
-def test_a_map_needs_the_keys_that_its_table_calls_required(tmp_path: Path, without: str) -> None:
-    urdf = write_arm(tmp_path)
-    (tmp_path / "arm.srdf").write_text("<robot name='arm'/>")
-    left_out = "arms.SIDE.elbow" if without == "arms.SIDE.elbow.link" else without  # an elbow has a link
-    lines = [f"{key} = {value}" for key, value in STATED.items() if not key.startswith(left_out)]
-    text = "\n".join(lines).replace("SIDE", "right").replace("JOINT", "elbow").replace("LINK", "forearm")
-    urdf.with_suffix(".toml").write_text(text)
-    if without != "nothing" and REQUIRED[without]:
-        with pytest.raises(errors.WeposeError):
-            retargeting.load_robot(retargeting.read_map(tmp_path / "arm.toml"))
-        return
-    robot = retargeting.load_robot(retargeting.read_map(tmp_path / "arm.toml"))
-    shape = next(shape for shape in robot.geometry.geometryObjects if shape.name == "forearm_0")
-    stated = {key: not key.startswith(left_out) for key in STATED}
-    assert shape.placement.translation[2] == (-0.2 if stated["collision.LINK.xyz"] else 0.0)
-    assert shape.placement.rotation[0, 0] == pytest.approx(np.cos(0.5 if stated["collision.LINK.rpy"] else 0.0))
-
-
-def test_the_page_has_the_keys_that_are_tested() -> None:
-    assert set(STATED) == set(REQUIRED)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import SUBJECT, within
+from simulated import SUBJECT
 
 import wepose_pin as wp
 from wepose_pin import WeposeError, calibrate, simulate, simulate_person
@@ -29,19 +29,6 @@ def test_protocols_join(tmp_path: Path) -> None:
         load_protocol("clasp+t_poes")
     with pytest.raises(WeposeError, match=r"protocol 'clasp\+table' is not simulated"):
         simulate(SUBJECT, seed=3, protocol="clasp+table")
-
-
-def test_parts_are_done_as_they_say() -> None:
-    """Palms stay together, arms are level, the torso bends forwards."""
-    options = {"rate_hz": 50.0, "noise": wp.NOISE_FREE, "clasp_s": 60.0, "circles": 0}
-    simulation = simulate(SUBJECT, seed=3, protocol="clasp+t_pose+bow", **options)
-    clasp, up = within(simulation, "clasp"), np.array((0.0, 0.0, 1.0))
-    assert np.ptp(simulation.points["left_palm"][clasp] - simulation.points["right_palm"][clasp]) < 1e-9
-    for side in ("left", "right"):
-        raised = Rotation.from_quat(simulation.quat_WL[f"{side}_upper_arm"][within(simulation, "t_pose")][50:-50])
-        assert abs(np.degrees(np.arcsin(raised.apply(-up) @ up)).mean() + 3.0) < 0.5  # as people hold it
-    torso = Rotation.from_quat(simulation.quat_WL["torso"][within(simulation, "bow")])
-    assert np.degrees(np.arccos(torso.apply(up) @ up)).max() == pytest.approx(45.0, abs=0.5)
 
 
 def test_free_motion_shows_headings_and_keeps_lengths() -> None:

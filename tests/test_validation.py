@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.trials import read_authors_trial, read_broad
 from benchmarks.validation import PAGE, RESULTS, format_results, list_experiments, simulated
 from benchmarks.validation.experiment import Result, run_experiment, summarize
 from benchmarks.validation.page import render_page
 from benchmarks.validation.simulated import MEASURED, calibrate_person, set_exact_mounts
-from wepose_pin.errors import WeposeError
 from wepose_pin.simulation import simulate, simulate_person
 
 
@@ -64,23 +61,3 @@ def test_the_page_is_what_the_stored_results_give() -> None:
     assert format_results(content) == RESULTS.read_text(encoding="utf-8")
     assert render_page(content) == PAGE.read_text(encoding="utf-8")
     assert set(simulated.list_experiments()) <= set(content), "an experiment without a result on the page"
-
-
-def test_trials_that_are_none_are_named(tmp_path: Path) -> None:
-    with pytest.raises(WeposeError, match="neither broad"):
-        list_experiments(data=tmp_path)
-    for read in (read_broad, read_authors_trial):
-        with pytest.raises(WeposeError, match="no such file"):
-            read(tmp_path / "nothing.mat")
-        (tmp_path / "text.mat").write_text("no trial\n")
-        with pytest.raises(WeposeError):
-            read(tmp_path / "text.mat")
-
-
-def test_real_trials_are_read_as_they_are(data: Path) -> None:
-    trial = read_broad(next(iter(sorted((data / "broad").glob("*.mat")))))
-    assert trial.rate_hz == pytest.approx(286, abs=1)
-    assert np.linalg.norm(trial.accel_S[trial.static], axis=1).mean() == pytest.approx(9.8, abs=0.2)
-    assert not trial.scored[trial.static].any()
-    authors = read_authors_trial(data / "wepose_hr" / "prova_HR.txt")
-    assert int(np.argmax(authors.scored)) == 725
