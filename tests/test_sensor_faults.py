@@ -279,17 +279,15 @@ def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, withi
 
 
 @pytest.mark.parametrize("options", [[], ["--causal"]])
-def test_a_start_pose_that_was_guessed_says_so(
+def test_a_mount_off_gravity_may_be_a_start_pose_that_is_another(
     options: list[str], made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Of a start pose that is stated, and of one that is guessed."""
     path = written(tmp_path / "in", made.recording("guessed"))
     text = (path / "session.toml").read_text()
     mount, phases = text.index("mount = {"), text.index("[phases]")
     wrong = text[:mount] + 'mount = { up = "+y", forward = "+x" }' + text[text.index("}", mount) + 1 :]
-    (path / "session.toml").write_text(wrong)
-    line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
-    assert "guessed" not in line
-    (path / "session.toml").write_text(wrong[:phases] + wrong[wrong.index("[sensors") :])
-    line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
-    assert "guessed" in line
-    assert "[phases] start = [[from, to]]" in line
+    for session in (wrong, wrong[:phases] + wrong[wrong.index("[sensors") :]):
+        (path / "session.toml").write_text(session)
+        line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
+        assert "the seconds of the start pose in [phases]" in line
