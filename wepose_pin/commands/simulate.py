@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from ..errors import BadOption, one_of
 from .options import MORE, RESEARCH, Duration, Force, Imperfection, Out, ProtocolName, SampleHz, Seed
 from .output import progress_bar, say
-
-if TYPE_CHECKING:
-    from ..simulation import Imperfections
 
 PROTOCOL, SHORT_PROTOCOL = "clasp+t_pose", "clasp"
 LEAST_S = 30.0  # from which on there is time for the T-pose
@@ -68,7 +64,7 @@ def simulate(
         dropped (share of the samples), gyro_warm_up_deg_s, accel_average.
     """
     options = dict(locals())
-    from dataclasses import replace
+    from dataclasses import fields, replace
 
     import numpy as np
 
@@ -83,7 +79,15 @@ def simulate(
     find_task(protocol or PROTOCOL)
     if activity is not None and protocol is not None:
         raise BadOption(f"--activity {activity} with --protocol {protocol}: one of them; leave one out")
-    sizes = choose_imperfections(preset, imperfection or {})
+    sizes, changes = room.PRESETS[preset], dict[str, Any](imperfection or {})
+    names = [each.name for each in fields(sizes)]
+    for name in changes:
+        if name not in names:
+            raise BadOption(f"--imperfection {name}: not an imperfection; {one_of(names, name, len(names))}")
+    try:
+        sizes = replace(sizes, **changes)
+    except BadOption as error:
+        raise BadOption(f"--imperfection: {error}") from None
     measured_std = room.PEOPLE_MEASURED_STD if preset == "people" else room.MEASURED_STD
     motion: dict[str, Any] = {"seed": seed, "rate_hz": rate_hz, "imperfections": sizes}
     with progress_bar() as progress, whole_folder(out, force) as folder:
@@ -118,19 +122,3 @@ def simulate(
     about = f"measured: {lengths}, stature {person.stature:.2f} m, sex {person.sex}"
     say(f"Session: {out / 'session.toml'}  ({about})")
     say(f"Truth: {out / 'truth.parquet'}  {out / 'subject.toml'}")
-
-
-def choose_imperfections(preset: str, changes: Mapping[str, float | str]) -> Imperfections:
-    """The imperfections of a preset, with the sizes that were given; `BadOption` where one is not possible."""
-    from dataclasses import fields, replace
-
-    from ..simulation import PRESETS
-
-    names = [each.name for each in fields(PRESETS[preset])]
-    for name in changes:
-        if name not in names:
-            raise BadOption(f"--imperfection {name}: not an imperfection; {one_of(names, name, len(names))}")
-    try:
-        return replace(PRESETS[preset], **dict[str, Any](changes))
-    except BadOption as error:
-        raise BadOption(f"--imperfection: {error}") from None

@@ -228,20 +228,17 @@ def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
     for joint, ranges in summary(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
-            ends = (
-                number(np.degrees(each[k]), 0, "°", unknown="")
-                for each in (ranges.lowest, ranges.highest, ranges.range)
-            )
+            extremes = np.degrees([ranges.lowest[k], ranges.highest[k], ranges.range[k]])
+            ends = (number(each, 0, "°", unknown="") for each in extremes)
             rate = number(np.degrees(ranges.peak_rate[k]), 0, " °/s", unknown="")
             std = spread(np.degrees(finite_median(stds[:, k])) if stds is not None else np.nan, 1, "°")
             near_lock = f"{100 * ranges.near_lock:.0f} %" if k != 1 else ""
             rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, std, near_lock])
     stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
-    elevation = any("elevation" in each.names for each in angles.joints.values())
     return [
-        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs. "
-        f"{'Elevation is negative where the arm is raised. ' if elevation else ''}"
-        f"Pronation is 90° with the palms at the thighs.{stated if has_stated_mounts(tracked) else ''}",
+        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs: elevation is "
+        "negative where the arm is raised, pronation is 90° with the palms at the thighs."
+        f"{stated if has_stated_mounts(tracked) else ''}",
         draw_joint_angles(angles),
         Table("", ["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
         "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
