@@ -1,16 +1,54 @@
-"""The packages that read formats: how they are imported, and what they raise as one line of ours."""
+"""What is installed: body models and calibration files, plug-ins, and packages that read formats.
+
+Assets are those of the checkout where there is one, else of the wheel. What a package raises becomes one line of ours.
+"""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-import polars as pl
+from .errors import BadData, BadOption, MissingFile, WeposeError, how_to_install, native_stderr_muted, reason
 
-from .errors import BadData, MissingFile, WeposeError, how_to_install, native_stderr_muted, reason
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def asset(folder: str, name: str) -> Path:
+    """Path of `name` in ``urdf/`` or ``calibration/``."""
+    for root in (_PACKAGE.parent, _PACKAGE / "_assets"):
+        path = root / folder / name
+        if path.is_file():
+            return path
+    raise FileNotFoundError(f"wepose_pin was installed without {folder}/{name}; install it again")
+
+
+@cache
+def find_plugins(group: str) -> dict[str, EntryPoint]:
+    """Name → what distributions register as entry points ``wepose.GROUP``: "readers", "writers", "sources", "outputs".
+
+    What this package brings is registered in the same way, in pyproject.toml. It stands first, and its names are taken.
+    """
+    found = sorted(entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin."))
+    if not found or not found[0].value.startswith("wepose_pin."):
+        raise BadOption(f"no {group} of wepose-pin are registered: install the package again")
+    plugins: dict[str, EntryPoint] = {}
+    for each in found:
+        plugins.setdefault(each.name, each)
+    return plugins
+
+
+@cache
+def load_plugin(group: str, name: str) -> Any:
+    """Load the object that is registered by this name; raise `BadOption` where it cannot be imported."""
+    try:
+        return find_plugins(group)[name].load()
+    except (ImportError, AttributeError) as error:
+        raise BadOption(f"plug-in {name} of wepose.{group} cannot be imported: {reason(error)}") from error
 
 
 def check_file(path: Path, kind: str) -> None:
@@ -32,6 +70,8 @@ def import_library(module: str, path: Path, kind: str) -> Any:
 @contextmanager
 def library_errors(path: Path, kind: str) -> Iterator[None]:
     """Turn errors that are not ours, on a file that cannot be read, into one `BadData`; `kind` is such as "a C3D"."""
+    import polars as pl
+
     try:
         with native_stderr_muted():  # polars prints its panics, which are no Exception
             yield

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..assets import asset
 from ..documents import read_toml
 from ..errors import BadModel, BadOption, one_of
+from ..libraries import asset
 from .table import BodyTable
 
 SEXES = ("f", "m")

@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 
 from ..arguments import check_arguments
-from ..assets import asset
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadSession, one_of
+from ..libraries import asset
 from . import lengths as _lengths
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS

@@ -33,12 +33,9 @@ _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> np.ndarray:
-    """Solve for the configuration `q` (n, nq) with the measured orientations, or the nearest one.
+    """Solve for `q` (n, nq) with the measured orientations, segment → (n, 4) xyzw, or the nearest configuration.
 
-    Parameters
-    ----------
-    quat_WL : segment → (n, 4) xyzw; an unmeasured segment is rigid with the one above
-    limits : keep the limits of joints with one axis; those of spherical joints are not kept
+    An unmeasured segment is rigid with the one above; `limits`: keep those of joints with one axis.
     """
     solver = ConfigurationSolver(model, quat_WL, limits=limits)
     return solver.solve(np.stack(list(quat_WL.values()), axis=1))

@@ -35,24 +35,20 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
     A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
     """
     robot = pickle.loads(pickle.dumps(robot, pickle.HIGHEST_PROTOCOL))  # several times as fast as `copy.deepcopy`
-    tree = parse_tree(robot, robot.name)
-    own, projections = measure_lengths(robot, table), _find_projections(tree, table)
-    ratio = {name: value / own[name] for name, value in targets.items()}
-    of_link: dict[str, np.ndarray] = {}  # S_W (3, 3)
-    of_joint: dict[str, np.ndarray] = {}
-    for segment, parts in projections.items():
-        S_W = np.eye(3) + sum((ratio.get(name, 1.0) - 1.0) * P for name, P in parts.items())
-        links, joints = _find_stretched(tree, table, segment)
-        of_link |= dict.fromkeys(links, S_W)
-        of_joint |= dict.fromkeys(joints, S_W)
+    tree, own = parse_tree(robot, robot.name), measure_lengths(robot, table)
+    of_links, of_joints = _find_stretches(tree, table)
     placed = {link.name: tree.neutral(link.name)[:3, :3] for link in robot.links}
+
+    def stretch(parts: Mapping[str, np.ndarray], R_WK: np.ndarray) -> np.ndarray:
+        ratios = {name: targets.get(name, own[name]) / own[name] for name in parts}
+        return R_WK.T @ (np.eye(3) + sum((ratios[name] - 1.0) * P for name, P in parts.items())) @ R_WK
+
     for joint in robot.joints:
-        if joint.name in of_joint and joint.origin is not None:
-            R_WK = placed[joint.parent]
-            joint.origin[:3, 3] = R_WK.T @ of_joint[joint.name] @ R_WK @ joint.origin[:3, 3]
+        if joint.name in of_joints and joint.origin is not None:
+            joint.origin[:3, 3] = stretch(of_joints[joint.name], placed[joint.parent]) @ joint.origin[:3, 3]
     for link in robot.links:
-        if link.name in of_link:
-            _stretch_link(link, placed[link.name].T @ of_link[link.name] @ placed[link.name])
+        if link.name in of_links:
+            _stretch_link(link, stretch(of_links[link.name], placed[link.name]))
     reached = measure_lengths(robot, table)
     for name, value in targets.items():
         if abs(reached[name] - value) > _TOLERANCE:
@@ -73,10 +69,18 @@ def _find_lines(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
     return {name: place(length.end) - place(length.start) for name, length in table.lengths.items()}
 
 
-def _find_projections(tree: Tree, table: BodyTable) -> dict[str, dict[str, np.ndarray]]:
-    """Segment → its lengths → P (3, 3): S_W = 1 + Σ (ratio − 1) P stretches the segment, all joints at zero."""
-    lines, projections = _find_lines(tree, table), dict[str, dict[str, np.ndarray]]()
-    for segment in table.segments:
+_Stretches = dict[str, dict[str, np.ndarray]]
+
+
+def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretches]:
+    """Link, and joint, → length → P (3, 3): S_W = 1 + Σ (ratio − 1) P stretches it, all joints at zero.
+
+    What stretches with a segment are the links from its own down to the next segments, to one of the spine also the
+    spine below it, down to the next segment or the root, which keep their shape.
+    """
+    lines, of_links, of_joints = _find_lines(tree, table), _Stretches(), _Stretches()
+    starts = {tree.body(segment.link) for segment in table.segments.values()}
+    for segment, own in table.segments.items():
         names = [name for name, length in table.lengths.items() if length.segment == segment]
         if not names:
             continue
@@ -86,24 +90,16 @@ def _find_projections(tree: Tree, table: BodyTable) -> dict[str, dict[str, np.nd
                 f"{table.where}: lengths.{', lengths.'.join(names)}: cannot stretch segment '{segment}' independently; "
                 f"up to three lengths in different directions are possible, between points in different places"
             )
-        # Across the lines of one or two lengths nothing changes.
-        dual = np.linalg.pinv(basis)
-        projections[segment] = {name: np.outer(basis[:, k], dual[k]) for k, name in enumerate(names)}
-    return projections
-
-
-def _find_stretched(tree: Tree, table: BodyTable, segment: str) -> tuple[list[str], list[str]]:
-    """The links and joints of a segment, which stretch with it.
-
-    These are the links from its own down to the next segments, to one of the spine also the spine below it, down to the
-    next segment or the root, which keep their shape.
-    """
-    start, starts = tree.body(table.segments[segment].link), {tree.body(each.link) for each in table.segments.values()}
-    links, spine = tree.hanging(start, starts), tree.path(start) if table.segments[segment].spine else []
-    spine = spine[max((k for k, joint in enumerate(spine) if joint.parent in starts), default=0) :]
-    links += [joint.parent for joint in spine[1:]]
-    joints = [joint.name for link in links for joint in tree.below[link]]
-    return links, [*joints, *(joint.name for joint in spine[:1])]
+        dual = np.linalg.pinv(basis)  # across the lines of one or two lengths nothing changes
+        parts = {name: np.outer(basis[:, k], dual[k]) for k, name in enumerate(names)}
+        start = tree.body(own.link)
+        links, spine = tree.hanging(start, starts), tree.path(start) if own.spine else []
+        spine = spine[max((k for k, joint in enumerate(spine) if joint.parent in starts), default=0) :]
+        links += [joint.parent for joint in spine[1:]]
+        of_links |= dict.fromkeys(links, parts)
+        of_joints |= {joint.name: parts for link in links for joint in tree.below[link]}
+        of_joints |= {joint.name: parts for joint in spine[:1]}
+    return of_links, of_joints
 
 
 def _stretch_link(link: Any, S: np.ndarray) -> None:
@@ -154,9 +150,7 @@ def measure_reaches(
     names = {joint: model.names[joint] for joint in range(model.njoints)}
     for segment in reversed(list(table.segments)):  # of segments that are rigid with one another the first
         names[model.frames[model.getFrameId(segment)].parentJoint] = segment
-    stretches: dict[str, dict[str, np.ndarray]] = {}
-    for segment, parts in _find_projections(tree, table).items():
-        stretches |= dict.fromkeys(_find_stretched(tree, table, segment)[1], parts)
+    _, stretches = _find_stretches(tree, table)
     follow = {joint for girdle in table.girdles.values() for joint in girdle.joints}
     reaches: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
     for point, place in table.points.items():

@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..assets import asset
 from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml
 from ..errors import BadModel, one_of
+from ..libraries import asset
 from ..recording.sensors import AXES, read_axes
 from .girdle import Direction, Girdle, SegmentName
 

@@ -25,12 +25,12 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..assets import asset
 from ..body import BodyTable, list_breadths
 from ..body.mounts import PALM_SLIP_STD
 from ..body.table import check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
+from ..libraries import asset
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
 DEFAULT = "clasp"

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Group, Parameter
 
-from ..assets import find_plugins, load_plugin
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, ExistingOutput, one_of
+from ..libraries import find_plugins, load_plugin
 from .options import (
     MORE,
     RESEARCH,

@@ -10,10 +10,10 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..assets import asset
 from ..body.urdf import find_example_data, read_urdf
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
+from ..libraries import asset
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1", "alex")
 SIDES = ("left", "right")

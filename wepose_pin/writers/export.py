@@ -13,13 +13,12 @@ import polars as pl
 
 from ..angles import angle_table, diagnose_lock, joint_angles
 from ..arguments import check_arguments
-from ..assets import find_plugins, load_plugin
 from ..body.kinematics import build_pose_table, find_samples
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import check_file as check_output
 from ..documents import whole_file
 from ..errors import BadData, BadOption, one_of
-from ..libraries import check_file
+from ..libraries import check_file, find_plugins, load_plugin
 from ..recording import select_interval
 from ..tracking import TrackResult
 from .bvh import write_bvh

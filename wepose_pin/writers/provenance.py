@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..assets import asset
 from ..body.table import MODEL_TABLE
 from ..documents import whole_folder
 from ..errors import ExistingOutput
-from ..libraries import check_file, library_errors
+from ..libraries import asset, check_file, library_errors
 from .result import JOINTS, versions
 
 FORMAT = 1

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ...assets import find_plugins, load_plugin
 from ...body import load_table
 from ...errors import BadOption, one_of
+from ...libraries import find_plugins, load_plugin
 from .base import Source, SourceKind, SourceOptions
 
 
