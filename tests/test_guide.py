@@ -238,7 +238,7 @@ def test_a_short_loss_is_bridged_and_a_long_one_needs_the_start_pose_again(tmp_p
     assert note == "No samples from any sensor. Switched on and in reach? Headings were lost: begin once more."
     assert session.guide.segments == session.person.worn
     session.run(lambda m: m.step == "clasp")
-    assert session.guide.attempts == 1
+    assert session.guide.attempt.path.name == "calibration-1.mcap"
     assert set(session.guide.attempt.recording().phases) == {"start"}
     session.guide.close()
 
@@ -301,7 +301,7 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     assert (session.guide.step.name, session.guide.segments) == ("assignment", {})
     session.run(lambda m: m.step == "start")
     assert session.guide.segments == worn
-    assert session.guide.attempts == 2  # of other sensors: another file
+    assert session.guide.attempt.path.name == "calibration-2.mcap"  # of other sensors
     session.guide.close()
 
 

@@ -315,7 +315,7 @@ def chaos(recording: Recording, seed: int, hurt: str) -> list[tuple[float, Sampl
 def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recording, tmp_path: Path, seed: int) -> None:
     hurt = list(recording.sensors)[seed + 1]
     came, watcher = chaos(recording, seed, hurt), Watcher()
-    run(recording, tmp_path / "a.mcap", Chaos(recording, came), watcher)
+    ended = run(recording, tmp_path / "a.mcap", Chaos(recording, came), watcher)
     log = read_live_log(tmp_path / "a.mcap")
     clean, again = track(recording, causal=True), track(log.recording, causal=True)
     n = len(log.quat_WL)
@@ -344,7 +344,7 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     assert sum(topic.startswith("/sensors/") for topic in topics) == len(came)
     arrived = {float(samples.time[0]) for _, samples in came if samples.sensor == hurt}
     missing = sum(float(t) not in arrived for t in recording.time)
-    counted = {sensor.segment: sensor.missing for sensor in watcher.statuses[-2].sensors}
+    counted = {segment: counts["lost"] for segment, counts in ended.counts.items()}
     assert 0.7 * missing < counted.pop(hurt) <= missing  # copies and wild times hide some
     assert set(counted.values()) == {0}
 

@@ -58,7 +58,7 @@ class Person:
 
     def status(self, state: str = "ready", message: str = "Tracking.", lost: tuple[str, ...] = ()) -> Status:
         sensors = tuple(
-            SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3.0, 1, 2, False)
+            SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3, False)
             for s in self.info.segments
         )
         actions = (Action("reset", "Reset headings", "r"),)
@@ -319,7 +319,7 @@ def test_the_start_and_the_motion_in_light_and_dark(motion: Person, browser: Bro
         assert rows[2].startswith("left forearm lost")
         browser.run("document.querySelector('#details').click()")
         row = browser.run("document.querySelector('#rows tr').innerText.replace(/\\s+/g, ' ')")
-        assert row == "torso static 100 0.11 −0.29 0.00 – 3 s 3"
+        assert row == "torso static 100 0.11 −0.29 0.00 – 3"
         assert browser.run(NARROW)
         assert "bad checksums: 3" in browser.run("document.body.innerText")
         stage, dark = box_of(browser, "#stage canvas"), {"light": False, "dark": True}

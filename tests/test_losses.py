@@ -27,8 +27,8 @@ def count(time_s: np.ndarray) -> int:
     monitor = SensorMonitor(LateSource())
     for k in range(0, len(time_s), 7):
         rows = np.zeros((len(time_s[k : k + 7]), 3))
-        monitor.push([Samples("torso", time_s[k : k + 7], rows, rows)])
-        missing = monitor.update(time_s[k], ["torso"])["torso"].missing
+        monitor.push([Samples("torso", time_s[k : k + 7], rows, rows)], ["torso"])
+        missing = monitor.update(time_s[k])["torso"].missing
     return missing
 
 
@@ -72,8 +72,8 @@ def test_the_rate_is_that_of_the_sensor_until_it_is_silent(samples: int, late_s:
     for k in range(0, 500, samples):
         time_s = np.arange(k, k + samples) / RATE_HZ
         source.now = time_s[-1] + late_s
-        monitor.push([Samples("torso", time_s + offset_s, rows, rows)])
+        monitor.push([Samples("torso", time_s + offset_s, rows, rows)], ["torso"])
         if k >= 200:
             for now in (source.now, source.now + samples / RATE_HZ):
-                assert monitor.update(now, ["torso"])["torso"].rate_hz == pytest.approx(RATE_HZ, abs=1.0)
+                assert monitor.update(now)["torso"].rate_hz == pytest.approx(RATE_HZ, abs=1.0)
     assert monitor.update(source.now + 1.1)["torso"].rate_hz == 0.0

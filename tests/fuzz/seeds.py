@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 import tempfile
-import zlib
 from pathlib import Path
 
 import device_files as df
@@ -161,9 +159,7 @@ def live_log() -> bytes:
 def datagrams() -> list[bytes]:
     one = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}
     two = {"sensor": "head", "t": [1, 2.5], "gyro": [[0.1, 0, 0], [0, 0, 1]], "accel": [[0, 0, 9], [0, 0, 9]]}
-    body = struct.pack("<4sBBHd14f", b"WPIN", 1, 3, 2, 1.5, *[0.0] * 14)
-    lines = "\n".join(json.dumps(message) for message in (one, two)).encode()
-    return [json.dumps(one).encode(), lines, body + struct.pack("<I", zlib.crc32(body))]
+    return [json.dumps(one).encode(), "\n".join(json.dumps(message) for message in (one, two)).encode()]
 
 
 def pose() -> bytes:

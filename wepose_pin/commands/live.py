@@ -161,12 +161,10 @@ def live(
     from ..calibration.protocols import GUIDED
     from ..compilation import announce_compilation
     from ..live import find_setup, open_source, run_session
-    from ..live.assignment import read_segments
-    from ..live.encoder import RobotFigure
     from ..live.guide import GuideOptions, choose_protocol
     from ..live.loop import warm_up
     from ..live.robot import RobotOutput, read_robot
-    from ..live.setup import build_subject_model, check_mounts
+    from ..live.setup import build_subject_model, check_mounts, read_segments
     from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView
     from ..retargeting.targets import check_person_arms
@@ -216,7 +214,8 @@ def live(
                 if guided is None:
                     say("The guided session was ended before a calibration was accepted.")
                     return Live(None, None)
-                (samples, worn), record = guided, record or _name_recording(folder)
+                (samples, worn), paths = guided, (folder / f"session-{number}.mcap" for number in itertools.count(1))
+                record = record or next(path for path in paths if not path.exists())
                 body = build_subject_model(worn, samples.sensors)
             if commands is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
@@ -224,7 +223,7 @@ def live(
                 if not commands.checks_contact:
                     print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
             if served is not None and driven is not None:
-                served.set_body(body, RobotFigure(driven.robot, body, driven.read_position))
+                served.set_body(body, driven.robot, driven.read_position)
             elif served is not None and guide:
                 served.set_body(body)
             outputs += _open_senders(senders)
@@ -271,22 +270,20 @@ def _print_end(ended: Live, record: Path | None) -> None:
     title = "no poses: the start pose was not held"
     if session.poses:
         p50, p99 = (1e3 * np.quantile(session.latency, (0.5, 0.99))).tolist()
-        title = (
-            f"{session.poses} poses in {session.seconds:.1f} s; from the newest sample to its pose {p50:.2f} ms (p50), "
-            f"{p99:.2f} ms (p99)"
-        )
+        latency = f"from the newest sample to its pose {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
+        title = f"{session.poses} poses in {session.seconds:.1f} s; {latency}"
     titles = ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off")
     keys = ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
     print_table(title, titles, [(name, *(str(each[key]) for key in keys)) for name, each in session.counts.items()])
     if robot is not None:
-        posed = robot.states.total()
+        posed, name = robot.states.total(), robot.robot.map.name
         shares = ", ".join(f"{100.0 * count / posed:.1f} % {state}" for state, count in robot.states.most_common())
-        title = f"{robot.robot.map.name}: {0 if robot.newest is None else robot.newest.number + 1} commands"
-        title += f"; with a pose {shares}" if posed else ", none with a pose"
+        count = 0 if robot.newest is None else robot.newest.number + 1
         rows = [
             (side, *(f"{1e3 * np.quantile(error, share):.1f}" if error else "–" for share in (0.5, 0.9)))
             for side, error in robot.errors.items()
         ]
+        title = f"{name}: {count} commands; with a pose {shares or 'none'}"
         print_table(title, ("arm", "hand off its target [mm]", "in 90 % under"), rows)
         print_diagnostics(robot.diagnostics)
     if session.problem:
@@ -301,7 +298,7 @@ def _print_end(ended: Live, record: Path | None) -> None:
 def _open_stream(source: str, worn: SensorSetup, model: BodyModel, folder: Path | None, guide: bool) -> Source:
     """The source of a stream, not yet opened; with the segments of an earlier guide's `folder`."""
     from ..live import open_source
-    from ..live.assignment import AssignedSource, read_segments
+    from ..live.setup import AssignedSource, read_segments
 
     sensors, segments = list(worn.mounts), list(model.table.segments)
     if guide:
@@ -330,7 +327,6 @@ def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_bro
 
 
 def _open_senders(named: Sequence[str]) -> list[Output]:
-    """Outputs for other programs, each ``NAME:ARGUMENT``."""
     senders: list[Output] = []
     for text in named:
         name, _, argument = text.partition(":")
@@ -338,9 +334,3 @@ def _open_senders(named: Sequence[str]) -> list[Output]:
             raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
         senders.append(load_plugin("outputs", name)(argument))
     return senders
-
-
-def _name_recording(folder: Path) -> Path:
-    """A file in the folder that is not there yet."""
-    number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.mcap").exists())
-    return folder / f"session-{number}.mcap"

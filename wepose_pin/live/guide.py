@@ -8,6 +8,7 @@ source's clock.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
@@ -34,8 +35,7 @@ from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
 from ..simulation import simulate
 from ..writers.live_log import LiveLog
-from .assignment import AssignedSource, write_segments
-from .setup import SensorSetup
+from .setup import AssignedSource, SensorSetup, write_segments
 from .sources.base import Source
 from .state import Action, GuideStep, GuideView, LivePose, Output, Stage, Status, StreamInfo, join_names
 from .ticks import SensorMonitor, TickStream
@@ -168,7 +168,6 @@ class Guide(Stage):
         self.ticks: list[Ticks] = []  # those of the attempt
         self.segments: dict[str, str] = {}  # sensor → segment that it is assigned to
         self.attempt: Attempt | None = None  # the recording; None before it begins
-        self.attempts = 0
         self.measured: dict[str, float] = {}  # lengths [m] that the person entered
         self.accepted: Calibration | None = None
         self._index, self._skipped = 0, set[str]()
@@ -203,7 +202,7 @@ class Guide(Stage):
 
     def process(self, samples: list[Samples]) -> None:
         self.now, self.samples, self.ticks = self.source.clock(), samples, []
-        self.monitor.push(samples)
+        self.monitor.push(samples, self.source.orientations)
         if self.attempt is not None:
             self._postponed += samples
             if self.step.records:
@@ -253,9 +252,8 @@ class Guide(Stage):
     def begin_attempt(self) -> Attempt:
         """Begin to record, unless a recording of these sensors runs."""
         if self.attempt is None:
-            self.attempts += 1
-            while (path := self.options.folder / f"calibration-{self.attempts}.mcap").exists():
-                self.attempts += 1
+            paths = (self.options.folder / f"calibration-{number}.mcap" for number in itertools.count(1))
+            path = next(path for path in paths if not path.exists())
             self.attempt, self._postponed = Attempt(path, self.assign_source(), self.options), []
         return self.attempt
 
@@ -267,7 +265,7 @@ class Guide(Stage):
         """Save the subject of the attempt's calibration, and end."""
         folder = self.options.folder
         for name in SUBJECT_FILES:
-            file = self.begin_attempt().log.path.with_suffix("") / name
+            file = self.begin_attempt().path.with_suffix("") / name
             if file.is_file():
                 shutil.copyfile(file, folder / name)
         write_segments(folder, self.segments)
@@ -287,7 +285,7 @@ class Guide(Stage):
 
     def build_status(self) -> Status:
         sensors = []
-        for name, known in sorted(self.monitor.update(self.now, self.source.orientations).items()):
+        for name, known in sorted(self.monitor.update(self.now).items()):
             segment = self.segments.get(name, name)
             label = name if segment == name else f"{segment} ({name})"
             sensors.append(known._replace(segment=label, lost=name in self.silent))
@@ -318,8 +316,8 @@ class Attempt:
     def __init__(self, path: Path, source: AssignedSource, options: GuideOptions) -> None:
         setup = replace(options.setup, remounted=True)
         self._header = setup.header(source.sensors, source.orientations) | {"method": options.method}
-        self._source, self.log = source, LiveLog(path, self._header)
-        self.stream = TickStream(source, log=self.log)
+        self.path, self._source, self.log = path, source, LiveLog(path, self._header)
+        self.stream = TickStream(source, self.log)
         self._markers, self._ticks = Markers(), list[Ticks]()
 
     @property
@@ -349,7 +347,7 @@ class Attempt:
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
         header = self._header | {"sensors": [*self.segments.values()], "phases": self._phases()}
-        return check_recording(build_recording(header, self.stream.rate_hz, self._ticks, None, self.log.path))
+        return check_recording(build_recording(header, self.stream.rate_hz, self._ticks, None, self.path))
 
     def _phases(self) -> dict[str, Any]:
         return self._markers.phases(float(self._ticks[0].time[0]), self.newest) if self._ticks else {}

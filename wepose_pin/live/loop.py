@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ..body.soft_tissue import SoftTissueCorrection
 from ..body.subject import parse_subject, subject_toml
 from ..body.table import check_segments
 from ..diagnostics import Diagnostic
-from ..errors import BadModel, BadSession, ExistingOutput, WeposeError
+from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
 from ..readers.live_log import LONGEST_TEXT, build_recording
 from ..recording import ImuSensor, Recording
@@ -32,7 +32,7 @@ from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker, TrackOptions
 from ..tracking.heading_problem import CAUSAL_KNOT_S
 from ..tracking.segments import SegmentEstimator
-from ..writers.live_log import LiveLog
+from ..writers.live_log import LiveLog, check_absent
 from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts
 from .sources.base import Source
@@ -99,10 +99,8 @@ class LiveLoop(Stage):
         self._tracker = Tracker(setup.subject, model=self.model, options=TrackOptions(method, causal=True))
         self._estimator: SegmentEstimator | None = None  # from when the start pose is found
         self._header = setup.header(source.sensors, source.orientations)
-        self.log: LiveLog | None = None
-        if record is not None:
-            further = {"method": method, "subject": subject_text, "versions": versions()}
-            self.log = LiveLog(Path(record), self._header | further, force)
+        further = {"method": method, "subject": subject_text, "versions": versions()}
+        self.log = LiveLog(None if record is None else Path(record), self._header | further, force)
         self._monitor, self._stream = SensorMonitor(source), TickStream(source, self.log)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
         # Where stated phases begin (True) and end, in order of time; a phase holds its first second and its last.
@@ -112,7 +110,7 @@ class LiveLoop(Stage):
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
         self._latency: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s]
-        self._poses, self._first_pose, self._last_pose, self._heading_reset_time = 0, 0.0, 0.0, 0.0
+        self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
         self._open_phases: dict[str, str] = {}  # name of the action that began it and ends it → phase
         self._takes = 0
         self._end_message = ""  # empty: it goes on
@@ -136,17 +134,16 @@ class LiveLoop(Stage):
             gc.unfreeze()
             sys.setswitchinterval(switch_interval)
             self.source.close()
-            if self.log is not None:
-                self.log.close()
-                if not self._poses:
-                    self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
-                    self.log = None
+            self.log.close()
+            if self.log.path is not None and not self._poses:
+                self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
+                self.log.path = None
             if self._end_message:  # when the recording is complete
                 self.send_status()
             for output in self.outputs:
                 output.close()
         counts = {}
-        for name, row in zip(self.source.sensors, self._read_counts().tolist(), strict=True):
+        for name, row in zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True):
             counts[name] = dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.missing[name]}
         return SessionSummary(
             self._poses,
@@ -154,19 +151,18 @@ class LiveLoop(Stage):
             counts,
             np.array(self._latency),
             self._diagnostics,
-            "" if self.log is None else self.log.problem,
-            None if self.log is None else self.log.path,
+            self.log.problem,
+            self.log.path,
         )
 
     # Samples to poses ------------------------------------------------------------------------------------------------
 
     def process(self, samples: list[Samples]) -> None:
         pose = None
-        self._monitor.push(samples)
+        self._monitor.push(samples, self.source.sensors if self._estimator else self.source.orientations)
         for ticks in self._stream.push(samples):
             pose = self._track(ticks) or pose
-        if self.log is not None:
-            self.log.flush_if_due()  # before it is shown: a pose that others know is in the file soon
+        self.log.flush_if_due()  # before it is shown: a pose that others know is in the file soon
         if pose is not None:
             for output in self.outputs:
                 output.show(pose)
@@ -187,8 +183,7 @@ class LiveLoop(Stage):
                 estimator.mark_phase(phase, begins=begins)
             quat_WL = self._soft_tissue.correct(estimator.step(ticks.gyro_S[n], ticks.accel_S[n]))
             self._update_std(estimator, ticks.first + n)
-            if self.log is not None:
-                self.log.pose(ticks.first + n, quat_WL)
+            self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:
             return None
         points = self.kinematics.compute_points(quat_WL)
@@ -218,16 +213,12 @@ class LiveLoop(Stage):
         assert estimator is not None
         self._search.ticks = []
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
-        self._first_pose = self._last_pose = self._heading_reset_time = float(recording.time[-1])
-        self._log_event("start", begin=begin, end=end)
+        self._first_pose = self._last_pose = float(recording.time[-1])
+        self.log.event("start", begin=begin, end=end)
         info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, self._stream.rate_hz)
         for output in self.outputs:
             output.start(info)
         return estimator
-
-    def _log_event(self, kind: str, **values: Any) -> None:
-        if self.log is not None:
-            self.log.event(kind, **values)
 
     # Actions ---------------------------------------------------------------------------------------------------------
 
@@ -235,7 +226,7 @@ class LiveLoop(Stage):
     def actions(self) -> tuple[Action, ...]:
         if self._end_message:
             return ()
-        if self._estimator is None or self.log is None:
+        if self._estimator is None or self.log.path is None:
             return (RESET,)
         marks = [BEGIN_TAKE, BEGIN_PHASE]
         for k, action in enumerate(marks):
@@ -246,10 +237,9 @@ class LiveLoop(Stage):
     def do(self, action: Action, text: str) -> None:
         text = text[:LONGEST_TEXT]
         if action.name == RESET.name:
-            if self._estimator is not None and self._stream.clock is not None:
+            if self._estimator is not None:
                 self._estimator.reset_headings()
-                self._heading_reset_time = self._stream.newest
-                self._log_event("reset", tick=self._stream.clock.next_tick)
+                self.log.event("reset", tick=self._stream.clock.next_tick)
             for output in self.outputs:
                 output.resume()
         elif action.name in (BEGIN_TAKE.name, BEGIN_PHASE.name) and self._estimator is not None:
@@ -262,39 +252,31 @@ class LiveLoop(Stage):
                 phase = self._open_phases.pop(action.name)
             # It begins with the next tick: the ticks before have been tracked without it.
             time_s = self._stream.newest + (1.0 / self._stream.rate_hz if begins else 0.0)
-            self._log_event("begin" if begins else "end", phase=phase, time=time_s)
+            self.log.event("begin" if begins else "end", phase=phase, time=time_s)
             self._estimator.mark_phase(phase, begins=begins)
         else:
-            self._log_event("mark", text=text or "mark", time=self._stream.newest)
+            self.log.event("mark", text=text or "mark", time=self._stream.newest)
 
     # The state -------------------------------------------------------------------------------------------------------
 
-    def _read_counts(self) -> np.ndarray:
-        """(k, `COUNTS`) of what the ticks were made of."""
-        clock = self._stream.clock
-        return np.zeros((len(self.source.sensors), len(COUNTS)), np.int64) if clock is None else clock.counts.copy()
-
     def build_status(self) -> Status:
         sensors, estimator, clock = self.source.sensors, self._estimator, self._stream.clock
-        now, counts = self.source.clock(), self._read_counts()
-        known = self._monitor.update(now, sensors if estimator is not None else self.source.orientations)
-        frozen = np.zeros(len(sensors), dtype=bool) if clock is None else clock.frozen.copy()
-        lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen
-        lost |= False if clock is None else clock.lost
+        now, counts, frozen = self.source.clock(), clock.counts, clock.frozen.copy()
+        known = self._monitor.update(now)
+        lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen | clock.lost
         problems, statuses = dict(self.source.problems), []
         for i, name in enumerate(sensors):
             status = known.get(name, SensorStatus(name))._replace(lost=bool(lost[i]), frozen=bool(frozen[i]))
-            status = status._replace(late=int(counts[i, LATE]), heading_std=float(self._heading_std[i]))
+            missing = status.missing + int(counts[i, LATE])
+            status = status._replace(missing=missing, heading_std=float(self._heading_std[i]))
             if estimator is not None:
-                bias, age_s = tuple(estimator.gyro_bias[i].tolist()), max(0.0, now - self._heading_reset_time)
-                status = status._replace(static=bool(estimator.static[i]), gyro_bias=bias, heading_age=age_s)
+                bias = tuple(estimator.gyro_bias[i].tolist())
+                status = status._replace(static=bool(estimator.static[i]), gyro_bias=bias)
             statuses.append(status)
             if counts[i, CUT_OFF]:
                 problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = int(counts[i, CUT_OFF])
-        recorded_s = 0.0
-        if self.log is not None:
-            recorded_s = 0.0 if clock is None else max(0.0, clock.newest - clock.begin)
-            problems |= {self.log.problem: 1} if self.log.problem else {}
+        problems |= {self.log.problem: 1} if self.log.problem else {}
+        recorded_s = 0.0 if self.log.path is None else max(0.0, clock.newest - clock.begin)
         latency = list(itertools.islice(reversed(self._latency), SHOWN_LATENCIES)) or [0.0]
         p50, p99 = (1e3 * np.quantile(latency, (0.5, 0.99))).tolist()
         description = self._describe_state(lost, frozen)
@@ -316,7 +298,7 @@ class LiveLoop(Stage):
         missing = [name for name in self.source.sensors if name not in self._monitor.sending]
         if not missing:
             return "waiting", "Measuring the sampling rate.", 0.0
-        awaited = self.source.describe_awaited(missing)
+        awaited = self.source.describe_awaited()
         where = f" Waiting for {awaited}." if awaited else ""
         return "waiting", f"Nothing has come yet from {join_names(missing)}.{where}", 0.0
 
@@ -337,8 +319,8 @@ def run_session(
     `model` None is the body of the setup, with the subject's lengths. Raises `WeposeError` where there is no such
     source, the mount of a sensor is not known, or the file `record` is there and `force` is not given.
     """
-    if record is not None and Path(record).exists() and not force:
-        raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
+    if record is not None:
+        check_absent(Path(record), force)
     check_mounts(source, setup)
     warm_up(method)  # before samples come
     if not open_and_wait(source, outputs, until):

@@ -1,20 +1,15 @@
 """The live page: the body in the browser while the person moves, served to this machine only.
 
 meshcat's own server listens on every interface and queues what a slow browser has not taken. So the page carries
-meshcat's viewer inside and gets frames through a WebSocket of ours: a browser that has not drawn its last frame gets
-none, and then the newest.
+meshcat's viewer inside and gets frames through ``/stream``, a WebSocket of ours, little endian. The browser answers
+each message with the text ``taken`` when it is drawn; until then no other comes, and then the newest.
 
-``/stream`` is a WebSocket, little endian. The browser answers each message with the text ``taken`` when it is drawn;
-until then no other comes.
-
-- Text: ``{"id": …}`` once (another id means another page to load); then each `state.Status` as JSON, five times a
-  second, in a guided session ten times, with its instructions under ``guide``, and under ``angles`` the joint angles in
-  degrees since the status before, with their times.
+- Text: ``{"id": …}`` once (another id means another page to load); then each `state.Status` as JSON, and under
+  ``angles`` the joint angles [deg] since the status before, with their times.
 - Binary: time (float64, NaN before the start); for each link its rotation row by row and its position [m] (12 float32);
   the points whose paths are drawn (3 float32 each); for each link whether its sensor is lost (1 byte). The names of the
   links are in the page; those of a robot come last.
-- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"action": "text", "text": "box"}``. It
-  answers only under an address or ``localhost``, and a WebSocket only from its own page.
+- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"action": "text", "text": "box"}``.
 """
 
 from __future__ import annotations
@@ -25,28 +20,37 @@ import contextlib
 import hashlib
 import hmac
 import json
+import math
 import re
 import secrets
 import socket
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from ipaddress import IPv4Address
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
+from ..angles import joint_angles
 from ..body import BodyModel
-from ..body.links import find_known_points
-from ..errors import BadOption
-from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
-from .encoder import PoseEncoder, RobotFigure, place_n_pose
+from ..body.kinematics import KinematicsSolver, Pose
+from ..body.links import find_known_links, find_known_points
+from ..errors import BadOption, WeposeError
+from ..report.viewer import DARK, LIGHT, Mesh, backdrop, choose_trail_colour, filled, find_floor, scene, view, visible
+from ..retargeting.placement import place_beside_person
+from ..retargeting.robot import Robot
+from ..retargeting.targets import find_person_arm
+from ..retargeting.visuals import build_parts
 from .sources.udp import LOOPBACK, name_host
 from .state import QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
 
+CURVE_RATE_HZ = 20.0  # of joint angles
+MAX_CURVE_POSES = 200  # that wait for a browser
 FINGERS = 0.1  # [m] beyond the end of a limb
 DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.6, 0.8]])
 MAX_REQUESTS = 16  # not yet taken; more are dropped
@@ -89,23 +93,21 @@ class LivePage(Output):
         try:
             listening = socket.create_server((host, port), backlog=16)
         except OSError as error:
-            raise BadOption(
-                f"the live page cannot listen on {host}:{port}: {error.strerror}; another port, or 0 for any that is "
-                f"free"
-            ) from None
+            text = f"the live page cannot listen on {host}:{port}: {error.strerror}; another port, or 0 for a free one"
+            raise BadOption(text) from None
         listening.setblocking(False)
         self.token = "" if host in (LOOPBACK, "localhost") else secrets.token_urlsafe(16)
         self.url = f"http://{name_host(host)}:{listening.getsockname()[1]}/"
         self.url += f"?token={self.token}" if self.token else ""
-        serve = lambda: asyncio.run(self._serve(listening))  # noqa: E731
-        self._thread = threading.Thread(target=serve, name="live page", daemon=True)
+        self._thread = threading.Thread(target=asyncio.run, args=(self._serve(listening),), daemon=True)
         self._thread.start()
 
-    def set_body(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
-        """Draw this body from now on, and a robot beside it; open browsers load the page again."""
-        encoder = PoseEncoder(model, robot)
-        self.html = _fill_page(model, encoder, self._title)
-        self.encoder = encoder
+    def set_body(
+        self, model: BodyModel, robot: Robot | None = None, position: Callable[[], np.ndarray | None] = lambda: None
+    ) -> None:
+        """Draw this body from now on, and a robot beside it at its joint `position`; browsers load the page again."""
+        encoder = PoseEncoder(model, None if robot is None else RobotFigure(robot, model, position))
+        self.html, self.encoder = _fill_page(model, encoder, self._title), encoder
 
     def demonstrate(self, pose: LivePose, info: StreamInfo) -> None:
         if self.encoder.info is not info:
@@ -116,8 +118,7 @@ class LivePage(Output):
         self.encoder.start(info)
 
     def show(self, pose: LivePose) -> None:
-        """Take the newest pose; it is drawn when a browser is ready for it. Costs less than a microsecond."""
-        self.encoder.show(pose)
+        self.encoder.show(pose)  # it is drawn when a browser is ready for it
 
     def status(self, status: Status) -> None:
         self.newest_status = status
@@ -178,8 +179,122 @@ class LivePage(Output):
         return self._encoded[1]
 
 
+class RobotFigure:
+    """A robot drawn beside the person, at the joint positions that `position` gives now; None: those at rest."""
+
+    def __init__(self, robot: Robot, model: BodyModel, position: Callable[[], np.ndarray | None]) -> None:
+        parts = build_parts(robot)
+        data = place_n_pose(model)
+        shoulders = [find_person_arm(model.table, arm.side).points[0] for arm in robot.arms]
+        heights = [data.oMf[model.pin.getFrameId(model.point_frames[point])].translation[2] for point in shoulders]
+        self._robot, self._position = robot, position
+        self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
+        self._joints = sorted({part.joint for part in parts})
+        self._data = robot.model.createData()
+        self.links = tuple(f"robot {joint}" for joint in self._joints)  # one for each moving part, and its mesh
+        self.meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
+
+    def place(self) -> np.ndarray:
+        """Rotation row by row and position [m] of each link in W, (links, 12)."""
+        position = self._position()
+        configuration = self._robot.configuration(self._robot.rest if position is None else position)
+        pin.forwardKinematics(self._robot.model, self._data, configuration)
+        return _stack([self._root * self._data.oMi[joint] for joint in self._joints])
+
+
+class PoseEncoder:
+    """Encodes poses for the page, with the robot beside the person if there is one."""
+
+    def __init__(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
+        self.identity = secrets.token_hex(8)  # of the page that draws its frames
+        self.visuals, self.robot = visible(model.visuals), robot
+        self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
+        self.links = self.body_links + (() if robot is None else robot.links)  # in the order of the frames
+        self.newest: LivePose | None = None  # to draw; None: the N-pose
+        self.info: StreamInfo | None = None  # of the poses; None before the start
+        self._model, self._lock = model, threading.Lock()  # the page encodes in a thread of its own
+        self._frames = [model.pin.getFrameId(link) for link in self.body_links]
+        data = place_n_pose(model)
+        self._neutral = _stack([data.oMf[frame] for frame in self._frames])
+        self._known = np.ones(len(self._frames), dtype=bool)
+        self._curve_poses, self._curve_due = deque[LivePose](maxlen=MAX_CURVE_POSES), -math.inf
+
+    def start(self, info: StreamInfo) -> None:
+        model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
+        known = find_known_links(model, info.segments)
+        moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
+        sensors = []  # of each link the row of the sensor that places it; -1: none
+        for frame in self._frames:
+            joint = model.pin.frames[frame].parentJoint
+            while joint and moved.get(joint) not in info.segments:
+                joint = model.pin.parents[joint]
+            sensors.append(info.segments.index(moved[joint]) if joint else -1)
+        with self._lock:
+            self._kinematics, self._placed = kinematics, [kinematics.data.oMf[frame] for frame in self._frames]
+            self._known = np.array([link in known for link in self.body_links], dtype=bool)
+            self._sensors = np.array(sensors, dtype=int)
+            self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.draw.paths]
+            self.newest, self.info = None, info  # the newest one may be of another stream
+            self._curve_poses.clear()
+
+    def show(self, pose: LivePose) -> None:
+        """Take the newest pose, also for the joint angles unless it is within a step of `CURVE_RATE_HZ`."""
+        self.newest = pose
+        if pose.time >= self._curve_due:
+            self._curve_due = pose.time + 1.0 / CURVE_RATE_HZ
+            self._curve_poses.append(pose)
+
+    def encode(self, pose: LivePose | None) -> bytes:
+        """The frame of a pose, None: the N-pose, as `page` describes it; NaN is what is not known."""
+        time, placements, lost = math.nan, self._neutral, np.zeros(len(self.links), dtype=bool)
+        points = np.full((len(self._model.table.draw.paths), 3), np.nan, "<f4")
+        with self._lock:
+            if pose is not None and self.info is not None and len(pose.quat_WL) == len(self.info.segments):
+                self._kinematics.compute_points(pose.quat_WL)
+                time, placements = pose.time, _stack(self._placed)
+                for k, row in enumerate(self._paths):
+                    points[k] = pose.points[row] if row >= 0 else np.nan
+                lost[: len(self._sensors)] = (self._sensors >= 0) & pose.lost[self._sensors]
+            placements = np.where(self._known[:, None], placements, np.float32(np.nan))
+        if self.robot is not None:
+            placements = np.concatenate([placements, self.robot.place()])
+        return np.array(time, "<f8").tobytes() + placements.tobytes() + points.tobytes() + lost.tobytes()
+
+    def take_angles(self) -> dict[str, Any] | None:
+        """Times [s], and joint → angle → values [deg], of the poses since the last call; None: there are none."""
+        poses = [self._curve_poses.popleft() for _ in range(len(self._curve_poses))]
+        if not poses or self.info is None:
+            return None
+        time = np.array([pose.time for pose in poses])
+        quat_WL = {name: np.array([pose.quat_WL[k] for pose in poses]) for k, name in enumerate(self.info.segments)}
+        try:
+            joints = joint_angles(Pose(time, quat_WL, {})).joints
+        except WeposeError:  # no two segments make a joint
+            return None
+        curves: dict[str, dict[str, Any]] = {name: {} for name in joints}
+        for name, joint in joints.items():
+            for angle, values in zip(joint.names, np.degrees(joint.values).T, strict=True):
+                curves[name][angle] = [round_finite(value, 1) for value in values]
+        return {"time": np.round(time, 3).tolist(), "joints": curves}
+
+
+def place_n_pose(model: BodyModel) -> pin.Data:
+    """Pinocchio's data with the frames of the N-pose."""
+    data = model.pin.createData()
+    pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
+    return data
+
+
+def _stack(placements: Sequence[Any]) -> np.ndarray:
+    rows = np.empty((len(placements), 12), dtype="<f4")
+    for k, placement in enumerate(placements):
+        rows[k, :9] = placement.rotation.ravel()
+        rows[k, 9:] = placement.translation
+    return rows
+
+
 class Guarded(RequestHandler):  # type: ignore[misc]
-    """Answers only who knows the page by its address and token."""
+    """Answers only under an address or ``localhost``, with the token where there is one, and to its own page."""
 
     def initialize(self, page: LivePage) -> None:
         self.page = page
@@ -209,7 +324,7 @@ class Page(Guarded):
         scripts = re.findall(r"<script>(.*?)</script>", html, flags=re.DOTALL)
         digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
         own = " ".join(f"'sha256-{digest}'" for digest in digests)
-        # meshcat's viewer creates style elements when it starts and fails without them.
+        # meshcat's viewer creates style elements when it starts.
         self.set_header(
             "Content-Security-Policy",
             f"default-src 'none'; script-src {own}; style-src 'unsafe-inline'; img-src data:; "
@@ -274,21 +389,22 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
     neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(body), offset=8).reshape(-1, 12)
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(body), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = neutral[:, 9:]
-    floor, reach, data = find_floor(model), [np.zeros((1, 3))], place_n_pose(model)
+    reach, data, draw = [np.zeros((1, 3))], place_n_pose(model), model.table.draw
     known = find_known_points(model, model.chains)
     p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
-    for first, *_, last in model.table.draw.limbs:  # in front, at the sides and up
-        if last in model.table.draw.paths and first in p_W and last in p_W:
+    for first, *_, last in draw.limbs:  # in front, at the sides and up
+        if last in draw.paths and first in p_W and last in p_W:
             reach.append(p_W[first] + (np.linalg.norm(p_W[last] - p_W[first]) + FINGERS) * DIRECTIONS)
     if robot is not None:
-        reach.append(robot.points())
+        reach.append(robot.place()[:, 9:])
+    backdrops = {name: backdrop(colours, find_floor(model)) for name, colours in (("light", LIGHT), ("dark", DARK))}
     content = {
         "id": encoder.identity,
         "links": list(links),
         "scene": scene(encoder.visuals, links, () if robot is None else robot.meshes),
-        "backdrops": {name: backdrop(colours, floor) for name, colours in (("light", LIGHT), ("dark", DARK))},
+        "backdrops": backdrops,
         "view": view(encoder.visuals, body, motion, reach),
-        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
+        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in draw.paths],
     }
     return filled("live/templates/live.html.j2", content, title or "wepose live")
 
@@ -300,7 +416,6 @@ def _to_json(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _to_json(item) for key, item in value.items()}
     if isinstance(value, tuple):
-        names = getattr(value, "_fields", None)
         items = [_to_json(item) for item in value]
-        return items if names is None else dict(zip(names, items, strict=True))
+        return dict(zip(value._fields, items, strict=True)) if hasattr(value, "_fields") else items
     return value

@@ -69,9 +69,8 @@ class RobotOutput(Output):
         if sensors:
             check_person_arms(stream.robot, sensors, table=table)
         self.stream, self.robot, self._table, self._speed = stream, stream.robot, table, speed
-        self._lengths_cov = (subject or population_subject(body=table)).lengths_covariance(
-            (table or load_table()).lengths
-        )
+        person, lengths = subject or population_subject(body=table), (table or load_table()).lengths
+        self._lengths_cov = person.lengths_covariance(lengths)
         self._sender = UdpSender(to, "to =", PORT)
         self._observer: ArmObserver | None = None
         self._newest: tuple[float, LivePose] | None = None  # with its time of arrival [s]
@@ -169,13 +168,13 @@ class RobotOutput(Output):
                     offset = self._clock_offset + (offset - self._clock_offset) * self.stream.dt / CLOCK_S
                 self._clock_offset = offset
         command = self.stream.step(begin + self._clock_offset, begin - self._came)
-        self.newest = command  # before it is sent: who hears of a command finds it described here
-        self._sender.send(command_json(self.robot, command, self._speed))
+        self.newest = command
         if not math.isnan(command.time):
             self.states[command.state] += 1
         if command.state in ("follow", "slow"):
             for arm, error in zip(self.robot.arms, command.error[:, 0].tolist(), strict=True):
                 self.errors[arm.side].append(error)
+        self._sender.send(command_json(self.robot, command, self._speed))  # whoever gets it finds all this described
         return command
 
 

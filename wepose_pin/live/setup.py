@@ -1,8 +1,8 @@
-"""What is known before the first sample: the subject, the mounts of the sensors, the body."""
+"""What is known before the first sample: the subject, the body, the sensors' mounts and segments."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,15 @@ from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.subject import Subject, load_subject, population_subject, subject_toml
 from ..body.table import NEUTRAL_POSE
+from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
 from ..readers.session_file import SensorKeys, read_head, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
+from ..recording.arrivals import Samples
 from .sources.base import Source
 from .sources.replay import ReplaySource
+
+SETUP_FILE = "setup.toml"
 
 
 @dataclass(frozen=True)
@@ -36,10 +40,8 @@ class SensorSetup:
     @classmethod
     def from_recording(cls, recording: Recording, subject: Subject | None = None) -> SensorSetup:
         mounts = {n: s.stated_quat_LS for n, s in recording.sensors.items() if s.stated_quat_LS is not None}
-        named = {
-            key: getattr(recording, key) for key in ("name", "phases", "start_pose", "remounted", "joints", "model")
-        }
-        return cls(subject=subject, mounts=mounts, **named)
+        keys = ("name", "phases", "start_pose", "remounted", "joints", "model")
+        return cls(subject=subject, mounts=mounts, **{key: getattr(recording, key) for key in keys})
 
     def header(self, sensors: Sequence[str], orientations: Mapping[str, bool] | None = None) -> dict[str, Any]:
         """Header of the recording of a live session, without the method; `orientations` as of a `Source`."""
@@ -109,3 +111,77 @@ def build_subject_model(setup: SensorSetup, sensors: Sequence[str] = (), model: 
     if setup.subject is None and chosen is not None:
         return body
     return (setup.subject or population_subject(body=body)).shape(body, remounted=setup.remounted)
+
+
+class AssignedSource(Source):
+    """A source whose sensors are named by the segments that they are assigned to.
+
+    `segments` are sensor of the source → segment, in this `order`; other sensors are left out. The source may be open.
+    """
+
+    def __init__(
+        self, source: Source, segments: Mapping[str, str], order: Iterable[str], is_open: bool = False
+    ) -> None:
+        super().__init__((segment for segment in order if segment in segments.values()), source.rate_hz)
+        self.source, self.segments, self._is_open = source, dict(segments), is_open
+        self.problems, self.begin = source.problems, source.begin
+
+    @property
+    def orientations(self) -> dict[str, bool]:
+        return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
+
+    @property
+    def batteries(self) -> dict[str, float]:
+        return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
+
+    def open(self) -> None:
+        if self._is_open:
+            while self.source.read(0.0):
+                pass
+        else:
+            self.source.open()
+
+    def connect(self, timeout_s: float) -> bool:
+        return self._is_open or self.source.connect(timeout_s)
+
+    def read(self, timeout_s: float) -> list[Samples] | None:
+        samples = self.source.read(timeout_s)
+        return None if samples is None else self.rename(samples)
+
+    def rename(self, samples: Iterable[Samples]) -> list[Samples]:
+        """The samples of the assigned sensors, named by their segments."""
+        return [each._replace(sensor=self.segments[each.sensor]) for each in samples if each.sensor in self.segments]
+
+    def describe_awaited(self) -> str:
+        return self.source.describe_awaited()
+
+    def explain_unit(self, key: str, unit: str) -> str:
+        return self.source.explain_unit(key, unit)
+
+    def clock(self) -> float:
+        return self.source.clock()
+
+    def close(self) -> None:
+        self.source.close()
+
+
+def read_segments(path: Path, known: Iterable[str]) -> dict[str, str]:
+    """Sensor → segment, of a setup file or its folder; raises `BadSession` where one is not `known`, or named twice."""
+    path = path / SETUP_FILE if path.is_dir() else path
+    segments, names = read_toml(path, "a sensor setup", BadSession).get("sensors"), tuple(known)
+    if not isinstance(segments, dict) or not segments:
+        raise BadSession(f"{path}: has no [sensors]; `wepose live --guide` writes a sensor setup")
+    for sensor, segment in segments.items():
+        if segment not in names:
+            raise BadSession(f"{path}: sensors.{sensor} = {segment!r} is not a segment; {', '.join(names)} are")
+    if len(set(segments.values())) < len(segments):
+        raise BadSession(f"{path}: [sensors] names a segment twice")
+    return dict(segments)
+
+
+def write_segments(folder: Path, segments: Mapping[str, str]) -> None:
+    """Write the setup file that `read_segments` reads."""
+    lines = ["format = 1", "", "[sensors]   # name that the source gives it = segment"]
+    lines += [f"{toml_key(sensor)} = {toml_string(segment)}" for sensor, segment in segments.items()]
+    with whole_file(folder / SETUP_FILE, force=True) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -46,9 +46,7 @@ class SensorStatus(NamedTuple):
     static: bool = False
     gyro_bias: tuple[float, ...] = (math.nan, math.nan, math.nan)  # [rad/s]
     heading_std: float = math.nan  # [rad]; NaN where the filter has no covariance
-    heading_age: float = math.nan  # [s] since the start, or the last reset of the headings
-    missing: int = 0  # samples that never came
-    late: int = 0  # samples that came after their tick
+    missing: int = 0  # samples that never came, or after their tick
     frozen: bool = False  # its values repeat bit for bit, though it has noise
     battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
 
@@ -182,7 +180,7 @@ class Stage(ABC):
 
     @abstractmethod
     def do(self, action: Action, text: str) -> None:
-        """Do what the person asks for, with the text that was typed for it."""
+        """Do one of these, with the text that was typed for it."""
 
     @abstractmethod
     def process(self, samples: list[Samples]) -> None:
@@ -194,9 +192,10 @@ class Stage(ABC):
 
     def ask(self, request: Request) -> None:
         """Do what the person asks for; what is not offered now is ignored."""
-        action = next((action for action in self.actions if action.name == request.action), None)
-        if action is not None:
-            self.do(action, request.text)
+        for action in self.actions:
+            if action.name == request.action:
+                self.do(action, request.text)
+                return
 
     def loop(self, should_stop: Callable[[], bool]) -> None:
         """Read, until this is over, the source ends, the person quits or `should_stop` returns True."""
@@ -206,10 +205,11 @@ class Stage(ABC):
             if samples is None:
                 return
             self.process([chunk for chunk in samples if len(chunk.time)])
-            for request in [request for output in self.outputs for request in output.take_requests()]:
-                if request == QUIT:
-                    return
-                self.ask(request)
+            for output in self.outputs:
+                for request in output.take_requests():
+                    if request == QUIT:
+                        return
+                    self.ask(request)
             if time.monotonic() >= due:
                 due = time.monotonic() + self.STATUS_PERIOD_S
                 self.send_status()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
@@ -18,14 +18,20 @@ from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.quality import ENOUGH_SAMPLES, format_longest
 from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
-from .assignment import AssignedSource, ShakeDetector
-from .guide import SILENCE_S, STATURE, Guide, GuideOptions, Step, StepRun, Turn
+from ..recording.arrivals import Samples, unpack_orientations
+from ..tracking.start_pose import StartPoseDetector
+from .guide import STATURE, Guide, GuideOptions, Step, StepRun, Turn
 from .loop import open_and_wait, warm_up
-from .setup import SensorSetup
+from .setup import AssignedSource, SensorSetup
 from .sources.base import Source
 from .state import Action, GuideView, LengthEstimate, Output, join_names
-from .ticks import StillPose, check_units
+from .ticks import check_units
 
+SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
+SHAKE_RATE = 2.5  # [rad/s] rms of a sensor that is shaken; a person who stands is below 0.1
+SHAKE_RATIO = 1.6  # of the shaken sensor's rms to that of every other candidate
+CALM_RATE = 0.6  # [rad/s] below which all must be before the next shake counts
+SHORTEST_STEP_S = 2e-3  # [s] between two orientations: of a tracker that does not tell its time they come in bursts
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
 GET_READY_S = 8.0  # [s] to leave the keyboard and take the pose
 MOST_LOSS_S = 2.0  # [s] of a silent sensor after which its heading has to be estimated anew
@@ -93,12 +99,60 @@ def make_steps(protocol: Protocol) -> list[Step]:
 # Before the motion ---------------------------------------------------------------------------------------------------
 
 
+class ShakeDetector:
+    """Detects which sensor is shaken; after one was found, all must come to rest before the next."""
+
+    def __init__(self) -> None:
+        self.is_calm = False  # all have come to rest since the last shake: the next one counts
+        self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
+        self._last: dict[str, tuple[float, np.ndarray]] = {}  # sensor → time [s] and (4,) of its last orientation
+
+    def push(self, samples: Iterable[Samples], measured: Collection[str] = ()) -> None:
+        """Add samples of any sensors; those of `measured` are orientations."""
+        for chunk in samples:
+            squares = np.sum(chunk.gyro_S**2, axis=1)
+            if chunk.sensor in measured:  # from each orientation to the next
+                quat = unpack_orientations(chunk.gyro_S, chunk.accel_S)
+                last_time, last_quat = self._last.get(chunk.sensor, (chunk.time[0], quat[0]))
+                self._last[chunk.sensor] = float(chunk.time[-1]), quat[-1]
+                cosine = np.abs(np.sum(np.concatenate([last_quat[None], quat[:-1]]) * quat, axis=1))
+                step_s = np.maximum(np.diff(chunk.time, prepend=last_time), SHORTEST_STEP_S)
+                squares = (2.0 * np.arccos(np.minimum(cosine, 1.0)) / step_s) ** 2
+            recent = self._recent.setdefault(chunk.sensor, deque())
+            recent.extend(zip(chunk.time.tolist(), squares.tolist(), strict=True))
+            while recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
+                recent.popleft()
+
+    def find(self, candidates: Sequence[str]) -> str | None:
+        """The candidate that is shaken; None: none, several, or those of the last shake still move."""
+        rates = self._find_rates()
+        if not self.is_calm:
+            self.is_calm = max(rates.values(), default=0.0) < CALM_RATE
+            return None
+        *_, second, first = sorted(["", "", *candidates], key=lambda sensor: rates.get(sensor, 0.0))
+        if rates.get(first, 0.0) < max(SHAKE_RATE, SHAKE_RATIO * rates.get(second, 0.0)):
+            return None
+        self.is_calm = False
+        return first
+
+    def list_moving(self) -> list[str]:
+        return [sensor for sensor, rate in self._find_rates().items() if rate > CALM_RATE]
+
+    def _find_rates(self) -> dict[str, float]:
+        """Sensor → rms rate [rad/s] of those that were seen for as long as a shake takes."""
+        return {
+            sensor: float(np.sqrt(np.mean([square for _, square in recent])))
+            for sensor, recent in self._recent.items()
+            if recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
+        }
+
+
 def find_sensors(guide: Guide, _: Turn) -> StepRun:
     needed = len(guide.needs)
     while True:
         sending = guide.monitor.sending
         count = len(sending) - len(guide.silent)
-        awaited = guide.source.describe_awaited([name for name in guide.source.sensors if name not in sending])
+        awaited = guide.source.describe_awaited()
         sentence = f"Strap the sensors on and switch them on: {count} of {needed} send."
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
@@ -153,34 +207,33 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
 def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
     """Wait until the person is ready, then until the start pose was held in right units; the motions begin anew."""
     attempt, reason, protocol = guide.begin_attempt(), turn.reason, guide.options.joined
-    seconds, do = START_POSE_S, "Stand still in the start pose."
-    for step in protocol.steps:
-        if step.phase == "start":
-            seconds, do = step.seconds, step.do
+    starts = [(step.seconds, step.do) for step in protocol.steps if step.phase == "start"]
+    seconds, do = starts[0] if starts else (START_POSE_S, "Stand still in the start pose.")
     while True:
         asked = None
         while asked is not READY:
             asked = yield GuideView(do, reason or guide.describe_problems(), actions=(READY,))
-        for phase in ("start", *(step.phase for step in protocol.steps)):
+        for phase in {"start", *(step.phase for step in protocol.steps)}:
             attempt.mark("discard", phase=phase)
         begin, reason, moved, progress = guide.now + GET_READY_S, "", "", 0.0
-        pose: StillPose | None = None  # from the first tick on
+        pose: StartPoseDetector | None = None  # from the first tick on
         while not (asked is AGAIN or reason):
             for ticks in guide.ticks if guide.now >= begin else ():
-                pose = pose or StillPose(attempt.stream, seconds)
-                row = pose.push_ticks(ticks)
+                pose = pose or attempt.stream.detect_start_pose(seconds)
+                row = pose.push(ticks.gyro_S, ticks.accel_S)
                 progress, moving = pose.held_s / seconds, [[*attempt.segments.values()][k] for k in pose.moving]
                 moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
                 moved = moved if pose.state == "moved" else ""
                 if row is not None:
-                    span = float(ticks.time[row]) - seconds + 1.0 / attempt.stream.rate_hz, float(ticks.time[row])
+                    last = float(ticks.time[row])
+                    first = last - seconds + 1.0 / attempt.stream.rate_hz
                     try:
-                        check_units(replace(attempt.recording(), phases={"static": (span,)}), guide.source)
+                        check_units(replace(attempt.recording(), phases={"static": ((first, last),)}), guide.source)
                     except BadData as error:
                         reason = str(error)
                         break
-                    attempt.mark("begin", phase="start", time=span[0])
-                    attempt.mark("end", phase="start", time=span[1])
+                    attempt.mark("begin", phase="start", time=first)
+                    attempt.mark("end", phase="start", time=last)
                     return Turn()
             countdown = begin - guide.now if guide.now < begin else (1.0 - progress) * seconds
             note = guide.describe_problems() or moved
@@ -195,15 +248,13 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
     attempt, phase, target_s = guide.begin_attempt(), motion.phase, motion.seconds
     if turn.again:
         target_s = max(target_s, attempt.measured_s(phase) + min(MORE_S, target_s))
-    begin, running, silent_since = guide.now + GET_READY_S, False, math.inf
+    begin, running = guide.now + GET_READY_S, False
     estimate: Calibration | None = None  # of the motion so far
     future: Future[Calibration] | None = None  # the next one
     estimated_s, optional = 0.0, guide.options.optional
     try:
         while (done_s := attempt.measured_s(phase)) < target_s:
-            silent = guide.silent
-            silent_since = min(silent_since, guide.now) if silent else math.inf
-            if guide.now - silent_since > MOST_LOSS_S - SILENCE_S:
+            if guide.monitor.list_silent(guide.segments, guide.now, MOST_LOSS_S):
                 return Turn("start", reason=f"{guide.describe_problems()} Headings were lost: begin once more.")
             if not running and guide.now >= begin:
                 attempt.mark("begin", phase=phase, time=attempt.newest)
@@ -217,7 +268,7 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
             finish = [FINISH] * (done_s > min(FINISH_AFTER_S, motion.seconds))
             view = GuideView(
                 _choose_sentence(motion, done_s),
-                guide.describe_problems() if silent else "",
+                guide.describe_problems() if guide.silent else "",
                 None if running else max(0.0, begin - guide.now),
                 max(0.0, target_s - done_s),
                 done_s / target_s,
@@ -240,7 +291,7 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
 
 
 def _choose_sentence(motion: ProtocolStep, done_s: float) -> str:
-    """The sentence of the instruction after so much of the motion: first the first, then the others in turn."""
+    """First the first sentence of the instruction, then the others in turn."""
     sentences = [f"{part.strip().rstrip('.')}." for part in motion.do.replace("\n", " ").split(". ")]
     further, turn = sentences[1:] or sentences, int(done_s / SENTENCE_S)
     return sentences[0] if turn == 0 else further[(turn - 1) % len(further)]
@@ -292,7 +343,7 @@ def show_result(guide: Guide, _: Turn) -> StepRun:
     attempt.log.flush()
     entered = note = ""  # a length that was entered, and why it cannot be
     while True:
-        future = calculate(partial(options.calibrate, attempt.log.path, dict(guide.measured)))
+        future = calculate(partial(options.calibrate, attempt.path, dict(guide.measured)))
         while not future.done():
             view = GuideView("The motion is being evaluated. You may move freely.", note, actions=(RESTART,))
             if (yield view) is RESTART:

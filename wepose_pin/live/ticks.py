@@ -22,7 +22,7 @@ from .sources.base import Source
 from .state import SensorStatus, join_names
 
 UNIT_WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
-TRACKED_WINDOW_S = 1.0  # [s] in place of that window where the unit is known
+FIRST_SAMPLES = 50  # by which a sensor's step is measured
 OVERTAKEN_S = 0.5  # [s] after which a sample that has not come counts as missing
 SILENT_STEP_S = 0.25  # [s] a longer step is a silence
 JUMP_S = 60.0  # [s] between two samples, from which on the clock was set
@@ -54,52 +54,63 @@ class SensorMonitor:
         self.missing = Counter[str]()  # samples that never came
         self._source = source
         self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
-        self._counted: dict[str, float] = {}  # sensor → time [s] of the sample up to which they are counted
-        self._recent: dict[str, list[Samples]] = {}
+        self._times: dict[str, list[np.ndarray]] = {}  # of samples since the last one that was counted, or a second
+        self._steps: dict[str, float] = {}  # sensor → [s] between two samples
+        self._counted: dict[str, float] = {}  # sensor → time [s] of the sample up to which missing ones are counted
+        self._recent: dict[str, list[Samples]] = {}  # of which rates are compared with gravity
 
-    def push(self, samples: Iterable[Samples]) -> None:
-        """Take samples in their order of arrival."""
+    def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
+        """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
         for chunk in samples:
-            self._recent.setdefault(chunk.sensor, []).append(chunk)
+            self._times.setdefault(chunk.sensor, []).append(chunk.time)
             self._arrived[chunk.sensor] = self._source.clock()
             self.sending[chunk.sensor] = float(chunk.time[-1])
+            if chunk.sensor in unchecked:
+                self._recent.pop(chunk.sensor, None)
+            else:
+                self._recent.setdefault(chunk.sensor, []).append(chunk)
 
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
         """The sensors without a sample for longer than `silence_s` [s]."""
         return [name for name in sensors if now - self.sending.get(name, -math.inf) > silence_s]
 
-    def update(self, now: float, unchecked: Collection[str] = ()) -> dict[str, SensorStatus]:
-        """Rate over each sensor's last second, missing samples and battery; looks for a wrong unit as well.
-
-        The unit of the `unchecked` sensors is not watched.
-        """
-        statuses, wrong = {}, {}
-        for name, recent in self._recent.items():
-            time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*recent, strict=True))[1:])
+    def update(self, now: float) -> dict[str, SensorStatus]:
+        """Rate over each sensor's last second, missing samples and battery; looks for a wrong unit as well."""
+        self.wrong_unit, statuses = self._find_wrong_unit(), {}
+        for name, parts in self._times.items():
+            time_s = np.concatenate(parts)
             newest = next((t for t in time_s[::-1].tolist() if math.isfinite(t)), math.nan)
-            window_s = TRACKED_WINDOW_S if name in unchecked else UNIT_WINDOW_S
             counted = self._counted.setdefault(name, newest)
-            rows = (time_s >= min(newest - window_s, counted)) & (time_s < newest + 1.0)
-            recent[:] = [Samples(name, time_s[rows], gyro_S[rows], accel_S[rows])]
-            times = np.unique(time_s[rows])
-            steps, step = np.diff(times), measure_step(times) or math.inf
-            done = times[1:] <= newest - OVERTAKEN_S
-            new = done & (times[1:] > counted) & (steps < JUMP_S)
-            self.missing[name] += int(np.maximum(np.rint(steps[new] / step) - 1.0, 0.0).sum())
-            self._counted[name] = float(times[1:][done][-1]) if done.any() else counted
+            time_s = np.unique(time_s[(time_s >= min(newest - 1.0, counted)) & (time_s < newest + 1.0)])
+            parts[:] = [time_s]
+            if name not in self._steps and len(time_s) >= FIRST_SAMPLES:
+                self._steps[name] = measure_step(time_s)
+            done = time_s[1:] <= newest - OVERTAKEN_S
+            if step := self._steps.get(name, 0.0):
+                steps = np.diff(time_s)[done & (time_s[1:] > counted)]
+                self.missing[name] += int(np.rint(steps[(steps > 1.5 * step) & (steps < JUMP_S)] / step - 1.0).sum())
+            self._counted[name] = float(time_s[1:][done][-1]) if done.any() else counted
             rate_hz = float(np.count_nonzero(time_s > newest - 1.0)) if now - self._arrived[name] < 1.0 else 0.0
             battery = self._source.batteries.get(name, math.nan)
             statuses[name] = SensorStatus(name, rate_hz, missing=self.missing[name], battery=battery)
-            span_s = float(np.ptp(times)) if len(times) else 0.0
-            if name not in unchecked and span_s > 0.9 * UNIT_WINDOW_S:
+        return statuses
+
+    def _find_wrong_unit(self) -> str:
+        rates = {}
+        for sensor, recent in self._recent.items():
+            time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*recent, strict=True))[1:])
+            newest = float(np.max(time_s, where=np.isfinite(time_s), initial=-np.inf))
+            rows = time_s > newest - UNIT_WINDOW_S
+            recent[:] = [Samples(sensor, time_s[rows], gyro_S[rows], accel_S[rows])]
+            span_s = newest - float(np.min(time_s, where=rows, initial=newest))
+            if span_s > 0.9 * UNIT_WINDOW_S:
                 rate = find_unseen_rate(gyro_S[rows], accel_S[rows], (np.count_nonzero(rows) - 1) / span_s)
                 if math.isfinite(rate):
-                    wrong[name] = rate
-        self.wrong_unit = ""
-        if wrong:
-            what = f"rates of {max(wrong.values()):.2g} rad/s while gravity does not turn: deg/s?"
-            self.wrong_unit = f"{join_names(list(wrong))}: {what} {self._source.explain_unit('gyro_unit', 'deg/s')}."
-        return statuses
+                    rates[sensor] = rate
+        if not rates:
+            return ""
+        what = f"rates of {max(rates.values()):.2g} rad/s while gravity does not turn: deg/s?"
+        return f"{join_names(list(rates))}: {what} {self._source.explain_unit('gyro_unit', 'deg/s')}."
 
 
 def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
@@ -113,43 +124,43 @@ def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
 class TickStream:
     """Makes ticks once every sensor has sent a sample and the rate is known, and records the arrivals.
 
-    `clock` makes the ticks; None before they begin.
+    `clock` makes the ticks; before they have begun it has seen nothing.
     """
 
-    def __init__(self, source: Source, log: LiveLog | None = None) -> None:
+    def __init__(self, source: Source, log: LiveLog) -> None:
         self.sensors, self.orientations, self.log = tuple(source.sensors), source.orientations, log
-        self.clock: StreamSynchronizer | None = None
+        self.clock = StreamSynchronizer(self.sensors, DEFAULT_RATE_HZ, 0.0, orientations=self.orientations)
+        self.has_begun = False
         self._rate_hz, self._begin = source.rate_hz, source.begin
         self._waiting: list[Arrivals] = []
 
     @property
     def rate_hz(self) -> float:
-        """Raises `BadData` before the ticks begin."""
-        if self.clock is None:
-            raise BadData("there are no samples of all sensors yet")
         return self.clock.rate_hz
 
     @property
     def newest(self) -> float:
         """Time [s] of the newest tick."""
-        return 0.0 if self.clock is None else self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
+        return self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
+
+    def detect_start_pose(self, hold_s: float = START_POSE_HOLD_S) -> StartPoseDetector:
+        measured = np.array([name in self.orientations for name in self.sensors], dtype=np.bool_)
+        return StartPoseDetector(self.rate_hz, measured, hold_s)
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record the samples of one read, and iterate over the ticks that they complete."""
         if not samples:
             return
         arrivals = order_arrivals(samples, self.sensors)
-        if self.log is not None:
-            self.log.samples(arrivals)
+        self.log.samples(arrivals)
         self._waiting.append(arrivals)
-        if self.clock is None:
+        if not self.has_begun:
             self._begin_ticks()
-        if self.clock is not None:
+        if self.has_begun:
             waiting, self._waiting = self._waiting, []
             for each in waiting:
                 yield from self.clock.push(each)
-                if self.log is not None:
-                    self.log.flush_if_due()
+                self.log.flush_if_due()
 
     def _begin_ticks(self) -> None:
         which, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
@@ -164,30 +175,15 @@ class TickStream:
             rates = [1.0 / step for step in map(measure_step, times) if step]
             rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ  # that of the slowest sensor
         self.clock = StreamSynchronizer(self.sensors, rate, begin, orientations=self.orientations)
-        if self.log is not None:
-            self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self.clock.wait_s)
-
-
-class StillPose(StartPoseDetector):
-    """Detects in the ticks of a stream that no sensor has moved for `hold_s` [s]."""
-
-    def __init__(self, stream: TickStream, hold_s: float = START_POSE_HOLD_S) -> None:
-        measured = np.array([name in stream.orientations for name in stream.sensors], dtype=np.bool_)
-        super().__init__(stream.rate_hz, measured, hold_s)
-
-    def push_ticks(self, ticks: Ticks) -> int | None:
-        """Add ticks; return the row of the one at which the pose has been held so long; None: not yet."""
-        for row, (gyro_S, accel_S) in enumerate(zip(ticks.gyro_S, ticks.accel_S, strict=True)):
-            if self.push(gyro_S, accel_S) == "ready":
-                return row
-        return None
+        self.has_begun = True
+        self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self.clock.wait_s)
 
 
 class StartPoseSearch:
     """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`."""
 
     def __init__(self, stream: TickStream, setup: SensorSetup, table: BodyTable) -> None:
-        self._stream, self._pose = stream, StillPose(stream)
+        self._stream, self._pose = stream, stream.detect_start_pose()
         self._stated = next(iter(setup.phases.get("start", ())), None)
         self._instruction = f"Hold still in the start pose, {setup.start_pose}"
         if table.is_mechanism:
@@ -207,7 +203,7 @@ class StartPoseSearch:
                 begin = round((self._stated[0] - self.ticks[0].time[0]) * rate_hz)
                 return max(0, begin), ticks.first + int(row[0]), int(row[0]) + 1
             return None
-        last = self._pose.push_ticks(ticks)
+        last = self._pose.push(ticks.gyro_S, ticks.accel_S)
         if last is not None:
             return self._pose.begin, self._pose.end, last + 1
         if len(self.ticks) > MAX_TICK_BLOCKS:

@@ -54,17 +54,25 @@ class StartPoseDetector:
         """The last tick so far."""
         return self._tick - 1
 
-    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> str:
-        """Add one tick, (k, 3) [rad/s] and [m/s²] or a packed orientation, NaN where lost; return the state."""
-        if self.state == "ready":
-            return self.state
+    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int | None:
+        """Add ticks, (n, k, 3) [rad/s] and [m/s²] or packed orientations, NaN where lost.
+
+        Return the row of the tick at which the pose was held so long, after which none may be added; None: not yet.
+        """
+        for row, tick in enumerate(zip(gyro_S, accel_S, strict=True)):
+            self._push_tick(*tick)
+            if self.state == "ready":
+                return row
+        return None
+
+    def _push_tick(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> None:
         self._tick += 1
         if self._measured.any():
             gyro_S = self._find_measured_rates(gyro_S, accel_S)
         self.missing = tuple(np.flatnonzero(~np.isfinite(gyro_S).all(axis=1)).tolist())
         if self.missing:
             self.state, self._held = "waiting", 0
-            return self.state
+            return
         self._gyro[self._held] = gyro_S
         self._held += 1
         if self._held % self._every == 0 or self._held == self._hold:
@@ -82,7 +90,6 @@ class StartPoseDetector:
             self.state = "ready"
         else:
             self.state = "moved" if self._tick - self._moved_at < self._rate else "start_pose"
-        return self.state
 
     def _find_measured_rates(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Return `gyro_S` with the rates of measured orientations since the last tick; zero at the first."""
@@ -107,7 +114,7 @@ def split_start_pose(received: Recording) -> tuple[Recording, Recording] | None:
     else:
         measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
         detector = StartPoseDetector(received.rate_hz, np.array(measured))
-        if all(detector.push(*tick) != "ready" for tick in zip(*stack_ticks(received), strict=True)):
+        if detector.push(*stack_ticks(received)) is None:
             return None
         interval = float(received.time[detector.begin]), float(received.time[detector.end])
     span, before = received.span(interval), dict[str, Intervals](start=(interval,))

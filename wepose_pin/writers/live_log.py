@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import time
@@ -23,21 +24,28 @@ LATEST_S = 1e10  # [s] of the clock of messages
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
+def check_absent(path: Path, force: bool) -> None:
+    """Raise `ExistingOutput` where a file is there that must not be replaced."""
+    if path.exists() and not force:
+        raise ExistingOutput(f"{path}: exists; --force replaces it, --record names another file")
+
+
 class LiveLog:
     """A file that holds all that was received, up to a quarter of a second before any end.
 
     A full disk ends the recording and not the session: `problem` holds the reason. The header is what is known before
-    the first sample; its `sensors` give the order of columns. `ExistingOutput` is raised where the file is there and
-    `force` is not given, or it cannot be written.
+    the first sample; its `sensors` give the order of columns. Without a `path` nothing is written. `ExistingOutput` is
+    raised where the file is there and `force` is not given, or it cannot be written.
     """
 
-    def __init__(self, path: Path, header: Mapping[str, Any], force: bool = False) -> None:
-        if path.exists() and not force:
-            raise ExistingOutput(f"{path}: exists; --force replaces it, --record names another file")
-        try:
-            self._file: BinaryIO | None = path.open("wb")
-        except OSError as error:
-            raise ExistingOutput(f"{path}: cannot be written: {error.strerror}") from error
+    def __init__(self, path: Path | None, header: Mapping[str, Any], force: bool = False) -> None:
+        self._file: BinaryIO | None = None
+        if path is not None:
+            check_absent(path, force)
+            try:
+                self._file = path.open("wb")
+            except OSError as error:
+                raise ExistingOutput(f"{path}: cannot be written: {error.strerror}") from error
         self.path, self.problem = path, ""
         self._sensors = list(header["sensors"])
         self._measured = [name in header["orientations"] for name in self._sensors]
@@ -45,12 +53,12 @@ class LiveLog:
         self._flushed = time.monotonic()
         # Of a disk that is full before they are known.
         self._channels, self._poses, self._events = [0] * len(self._sensors), 0, 0
-        self._writer: Any = Writer(self._file, CHUNK_BYTES)
+        self._writer: Any = Writer(self._file or io.BytesIO(), CHUNK_BYTES)
         self._write(lambda: self._begin(header))
 
     def samples(self, came: Arrivals) -> None:
         """What arrived, in the order of arrival."""
-        rows = zip(*(column.tolist() for column in came), strict=True)
+        rows = zip(*(column.tolist() for column in came), strict=True) if self._file is not None else ()
         for sensor, time_s, gyro, accel in rows:
             signals = {"orientation": [*gyro, accel[0]]} if self._measured[sensor] else {"gyro": gyro, "accel": accel}
             if math.isfinite(time_s):
@@ -98,8 +106,9 @@ class LiveLog:
         self._writer.flush()
 
     def _put(self, channel: int, message: Mapping[str, Any]) -> None:
-        data = _encode(message).encode()
-        self._write(lambda: self._writer.add_message(channel, self._time_ns, data, self._time_ns))
+        if self._file is not None:
+            data = _encode(message).encode()
+            self._write(lambda: self._writer.add_message(channel, self._time_ns, data, self._time_ns))
 
     def _write(self, write: Callable[[], None]) -> None:
         """Write, unless the recording has ended; it ends where that fails."""

@@ -15,7 +15,6 @@ def open_source(
     *,
     sensors: Sequence[str] | None = None,
     speed: float | str = 1.0,
-    baud: int = 115200,
     segments: Sequence[str] | None = None,
     any_name: bool = False,
 ) -> Source:
@@ -32,7 +31,7 @@ def open_source(
         forms = [load_plugin("sources", each).form for each in names]
         raise BadOption(f"source '{spec}' is none; {one_of(forms, name)}")
     known = tuple(load_table().segments if segments is None else segments)
-    options = SourceOptions(spec, None if sensors is None else tuple(sensors), known, any_name, speed, baud)
+    options = SourceOptions(spec, None if sensors is None else tuple(sensors), known, any_name, speed)
     if name != "replay":
         for sensor in options.sensors or ():
             options.check_segment(sensor)

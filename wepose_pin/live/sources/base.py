@@ -6,7 +6,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,7 +35,6 @@ class SourceOptions:
     segments: tuple[str, ...]  # names that sensors may have
     any_name: bool = False  # sensors have any names, begin to send at any time, and are assigned to segments later
     speed: float | str = 1.0  # of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
-    baud: int = 115200  # of serial ports
 
     def error(self, reason: str) -> BadOption:
         return BadOption(f"source '{self.spec}': {reason}")
@@ -90,8 +89,8 @@ class Source(ABC):
     def batteries(self) -> Mapping[str, float]:
         return {}
 
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
-        """Describe what is awaited from these sensors, without any from all, and where; empty where nothing is."""
+    def describe_awaited(self) -> str:
+        """Describe what is awaited, and where; empty where nothing is."""
         return ""
 
     def explain_unit(self, key: str, unit: str) -> str:

@@ -71,7 +71,7 @@ class LslSource(Source):
         """Search and subscribe; raises `BadSource` where a stream has other channels than it should."""
         query = " or ".join(f"starts-with(name,'{self._name}{end}')" for end in "-_") + f" or name='{self._name}'"
         answers = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=max(COLLECT_S, timeout_s))
-        for info in sorted(answers, key=lambda info: info.created_at()):  # of two with one name the older
+        for info in answers:
             if info.name() not in self._streams:
                 self._streams[info.name()] = self._subscribe(info)
         present = [sensor for stream in self._streams.values() for sensor in stream.sensors]
@@ -123,9 +123,9 @@ class LslSource(Source):
             raise BadSource(f"{where}: no channel label names a segment, as {self._segments[0]}_gyr_x")
         return Stream(inlet, sensors, float(full.nominal_srate()))
 
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
+    def describe_awaited(self) -> str:
         present = {sensor for stream in self._streams.values() for sensor in stream.sensors}
-        names = list(sensors) or [segment for segment in self.sensors if present and segment not in present]
+        names = [segment for segment in self.sensors if present and segment not in present]
         where = "where LSLAPICFG looks" if os.environ.get("LSLAPICFG") else "on this machine"
         return f"the LSL stream {self._name} {where}" + (f": {join_names(names)}" if names else "")
 

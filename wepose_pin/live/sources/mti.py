@@ -9,11 +9,10 @@ that a sample needs in one packet, in float32. Source: Xsens, MT Low Level Commu
 from __future__ import annotations
 
 import os
-import select
 import struct
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -27,17 +26,15 @@ from .base import HostClock, Source, SourceKind, SourceOptions
 
 GO_TO_MEASUREMENT, GO_TO_CONFIG, DATA, ERROR, SET_OUTPUT = 0x10, 0x30, 0x36, 0x42, 0xC0  # messages
 SAMPLE_TIME = 0x1060  # [1e-4 s]
-# Rate of turn [rad/s], acceleration [m/s²], in the axes of the sensor. Every MTi has the first outputs, up to 100 or
-# 400 Hz; some have the others ("HR"), up to 2 kHz.
-OUTPUTS = ((0x8020, 0x4020), (0x8040, 0x4040))
+GYRO, ACCEL = 0x8020, 0x4020  # rate of turn [rad/s] and acceleration [m/s²] in the sensor's axes, up to 100 or 400 Hz
 WITH_EVERY_PACKET = 0xFFFF  # rate of the time
-USUAL_HZ = 100
+USUAL_HZ, BAUD = 100, 115200  # a device on USB takes any baud
 ANSWER_S = 0.5  # [s] that a device has for an answer
 TRIES = 3
 SILENT_S = 3.0  # [s] without a byte, after which a port is reopened: not every adapter reports a pulled cable
 RETRY_S = 0.5  # [s] between two attempts to open a port
 WAIT_S = 0.05
-PAUSE_S = 0.002  # [s] between two reads: at 1 kHz two packets come at once, and cost half
+PAUSE_S = 0.002  # [s] between two reads
 
 Frame = tuple[int, bytes]  # MID and data
 
@@ -71,10 +68,9 @@ def parse_packet(data: bytes) -> tuple[float, tuple[float, ...]] | None:
         end = at + 3 + data[at + 2]
         items[(data[at] << 8 | data[at + 1]) & ~0xC] = data[at + 3 : end]  # two bits tell the axes of the world
         at = end
-    gyro, accel = next((pair for pair in OUTPUTS if pair[0] in items), OUTPUTS[0])
     try:
         (ticks,) = struct.unpack(">I", items[SAMPLE_TIME])
-        return 1e-4 * ticks, struct.unpack(">6f", items[gyro] + items[accel])
+        return 1e-4 * ticks, struct.unpack(">6f", items[GYRO] + items[ACCEL])
     except (KeyError, struct.error):
         return None
 
@@ -82,8 +78,8 @@ def parse_packet(data: bytes) -> tuple[float, tuple[float, ...]] | None:
 def open_spec(rest: str, options: SourceOptions) -> MTiSource:
     """The source of ``mti:DEVICE=SEGMENT,…[@RATE]``."""
     pairs, separator, rate = rest.rpartition("@")
-    if separator and not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
-        raise options.error(f"rate '{rate}'; whole samples a second from 1 to 2000, as @100")
+    if separator and not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 400):
+        raise options.error(f"rate '{rate}'; whole samples a second from 1 to 400, as @100")
     devices: dict[str, str] = {}
     for pair in (pairs if separator else rest).split(","):
         device, _, segment = pair.rpartition("=")
@@ -94,23 +90,23 @@ def open_spec(rest: str, options: SourceOptions) -> MTiSource:
             raise options.error(f"'{pair}': each device and each segment is named once")
         devices[segment] = device
     chosen = {name: devices[name] for name in options.choose(devices, "device for")}
-    return MTiSource(chosen, int(rate) if separator else USUAL_HZ, options.baud)
+    return MTiSource(chosen, int(rate) if separator else USUAL_HZ)
 
 
 class MTiSource(Source):
     """Sensors on `devices` (segment → port), which are configured, lastingly, to send at `rate_hz`.
 
     One thread a port opens it, configures the device and listens, again and again, so that arrivals are stamped in time
-    and a lost port is taken up when it is back. A device on USB takes any `baud`.
+    and a lost port is taken up when it is back.
     """
 
-    def __init__(self, devices: Mapping[str, str], rate_hz: int = USUAL_HZ, baud: int = 115200) -> None:
+    def __init__(self, devices: Mapping[str, str], rate_hz: int = USUAL_HZ) -> None:
         super().__init__(devices, rate_hz)
         try:
             import serial
         except ImportError:
             raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
-        self._serial, self._devices, self._hz, self._baud = serial, dict(devices), rate_hz, baud
+        self._serial, self._devices, self._hz = serial, dict(devices), rate_hz
         # Segment, times (m,) [s] and values (m, 6) of samples, or a problem.
         self._inbox: SimpleQueue[tuple[str, np.ndarray, np.ndarray] | str] = SimpleQueue()
         self._waits = dict.fromkeys(devices, "the port is being opened")  # segment → why nothing comes; empty: it does
@@ -146,8 +142,8 @@ class MTiSource(Source):
         while self._threads:
             self._threads.pop().join()
 
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        places = {name: f"{join_names([name])} at {self._devices[name]}" for name in sensors or self.sensors}
+    def describe_awaited(self) -> str:
+        places = {name: f"{join_names([name])} at {path}" for name, path in self._devices.items()}
         for name, place in places.items():
             if self._waits[name]:
                 return f"the MTi of {place}: {self._waits[name]}"
@@ -158,7 +154,7 @@ class MTiSource(Source):
     def _run(self, segment: str, path: str) -> None:
         while not self._stop.is_set():
             try:
-                with self._serial.Serial(path, self._baud, write_timeout=1.0, exclusive=True) as port:
+                with self._serial.Serial(path, BAUD, timeout=WAIT_S, write_timeout=1.0, exclusive=True) as port:
                     buffer = bytearray()
                     self._configure(port, buffer)
                     self._waits[segment] = ""
@@ -173,33 +169,29 @@ class MTiSource(Source):
     def _configure(self, port: Any, buffer: bytearray) -> None:
         """Ask for one packet with time, rate of turn and acceleration, in float32."""
         self._ask(port, buffer, GO_TO_CONFIG)
-        offers = []
-        for gyro, accel in OUTPUTS:
-            items = struct.pack(">6H", SAMPLE_TIME, WITH_EVERY_PACKET, accel, self._hz, gyro, self._hz)
-            mid, answer = self._ask(port, buffer, SET_OUTPUT, items)
-            rates = dict(struct.iter_unpack(">2H", answer[: len(answer) // 4 * 4])) if mid != ERROR else {}
-            offers.append(min(rates.get(gyro, 0), rates.get(accel, 0)))
-            if offers[-1] == self._hz:
-                self._ask(port, buffer, GO_TO_MEASUREMENT)
-                return
-        best = max(offers)
-        raise OSError(f"it has no {self._hz} Hz" + (f"; it offers {best} Hz: write @{best}" if best else ""))
+        items = struct.pack(">6H", SAMPLE_TIME, WITH_EVERY_PACKET, ACCEL, self._hz, GYRO, self._hz)
+        mid, answer = self._ask(port, buffer, SET_OUTPUT, items)
+        rates = dict(struct.iter_unpack(">2H", answer[: len(answer) // 4 * 4])) if mid != ERROR else {}
+        offer = min(rates.get(GYRO, 0), rates.get(ACCEL, 0))
+        if offer != self._hz:
+            raise OSError(f"it has no {self._hz} Hz" + (f"; it offers {offer} Hz: write @{offer}" if offer else ""))
+        self._ask(port, buffer, GO_TO_MEASUREMENT)
 
     def _ask(self, port: Any, buffer: bytearray, mid: int, data: bytes = b"") -> Frame:
         for _ in range(TRIES):
             port.write(build_frame(mid, data))
             deadline = time.monotonic() + ANSWER_S
             while time.monotonic() < deadline and not self._stop.is_set():
-                buffer += read_bytes(port)
+                buffer += port.read(port.in_waiting or 1)
                 for frame in take_frames(buffer)[0]:
                     if frame[0] in (mid + 1, ERROR):
                         return frame
-        raise OSError(f"no MTi answers at {self._baud} baud; check the cable, the port and the baud rate")
+        raise OSError(f"no MTi answers at {BAUD} baud; check the cable, the port and the baud rate")
 
     def _listen(self, segment: str, port: Any, buffer: bytearray) -> None:
         clock, last_byte = HostClock(), time.monotonic()
         while not self._stop.is_set():
-            data, now = read_bytes(port), time.monotonic()
+            data, now = port.read(port.in_waiting or 1), time.monotonic()
             if data:
                 last_byte = now
             elif now - last_byte > SILENT_S:
@@ -214,16 +206,6 @@ class MTiSource(Source):
                 time_s, values = map(np.array, zip(*samples, strict=True))
                 self._inbox.put((segment, clock.to_host(time_s, now), values))
             time.sleep(PAUSE_S)
-
-
-def read_bytes(port: Any) -> bytes:
-    """Bytes that came, none after a while; past pyserial, whose `read` costs twice as much."""
-    if not select.select([port.fileno()], [], [], WAIT_S)[0]:
-        return b""
-    data = os.read(port.fileno(), 4096)
-    if not data:
-        raise OSError("the port is gone")
-    return data
 
 
 KIND = SourceKind("mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]", open_spec)

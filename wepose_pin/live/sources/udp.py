@@ -1,4 +1,4 @@
-"""Samples from UDP datagrams: lines of JSON, or packed binary (docs/live-sources.md); what sources over UDP share."""
+"""Samples from UDP datagrams of JSON lines (docs/live-sources.md); what sources over UDP share."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import json
 import math
 import select
 import socket
-import struct
 import time
-import zlib
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -27,15 +25,7 @@ BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some secon
 COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
 MAX_SENSORS = 64  # of any name
 MAX_CLOCKS = 64  # of senders; one that opens a new socket for each datagram has many
-MAX_NAME = 24  # letters of a sensor's name
-MAGIC, VERSION = b"WPIN", 1
-HEADER = struct.Struct("<4sBBHd")  # magic, version, sensor, count, time [s] of the first sample
-SAMPLE = np.dtype([("after", "<f4"), ("values", "<f4", 6)])  # [s] after that time; gyro [rad/s], accel [m/s²]
-CRC = struct.Struct("<I")
-# The index is the sensor's number in the format, so names are never removed or moved.
-NUMBERS = tuple(
-    "torso left_upper_arm left_forearm right_upper_arm right_forearm pelvis head left_hand right_hand".split()
-)
+LONGEST_NAME = 24  # letters
 UNITS = {"gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}  # key → unit → factor to SI
 SI = {"gyro_unit": "rad/s", "accel_unit": "m/s^2"}
 JSON_LINE = '{"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8], "battery": 0.9}'
@@ -120,7 +110,7 @@ class DatagramSource(Source):
         self._searching = False
         return True
 
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
+    def describe_awaited(self) -> str:
         host, port = self.address
         dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
         here = " (this machine only)" if host.startswith("127.") else ""
@@ -164,15 +154,6 @@ class DatagramSource(Source):
             self._socket = None
 
 
-class Batch(NamedTuple):
-    """Samples of one sensor in a line or packet, on the sender's clock."""
-
-    sensor: str
-    time: np.ndarray  # (m,) [s]
-    values: np.ndarray  # (m, 6) gyro, accel
-    battery: float = math.nan  # share of its charge, 0 to 1; NaN: not said
-
-
 def open_spec(rest: str, options: SourceOptions) -> UdpSource:
     """The source of ``udp:[HOST:]PORT[,gyro_unit=…][,accel_unit=…]``."""
     address, *stated = rest.split(",")
@@ -201,7 +182,7 @@ class UdpSource(DatagramSource):
         host: str,
         port: int,
         sensors: Sequence[str] | None = None,
-        segments: Collection[str] | None = NUMBERS,
+        segments: Collection[str] | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(host, port, sensors, segments)
@@ -241,43 +222,31 @@ class UdpSource(DatagramSource):
         return samples
 
 
-def decode(
-    datagram: bytes, segments: Collection[str] | None = NUMBERS, units: Mapping[str, str] = SI
-) -> Iterator[Batch | str]:
-    """Iterate over the batches in a datagram, in SI, with a problem in place of each that is dropped; raises nothing.
+class Batch(NamedTuple):
+    """Samples of one sensor in a line, on the sender's clock."""
 
-    `segments` are names of sensors in lines of JSON; None: any. `units` are of what does not state its own.
+    sensor: str
+    time: np.ndarray  # (m,) [s]
+    values: np.ndarray  # (m, 6) gyro [rad/s], accel [m/s²]
+    battery: float  # share of its charge, 0 to 1; NaN: not said
+
+
+def decode(
+    datagram: bytes, segments: Collection[str] | None = None, units: Mapping[str, str] = SI
+) -> Iterator[Batch | str]:
+    """Iterate over the batches in a datagram, with a problem in place of each line that is dropped; raises nothing.
+
+    `segments` are names of sensors; None: any. `units` are of lines that do not state their own.
     """
-    is_binary = datagram[:4] == MAGIC
-    for part in [datagram] if is_binary else filter(bytes.strip, datagram.splitlines()):
+    for line in filter(bytes.strip, datagram.splitlines()):
         try:
-            batch, stated = (_decode_packet(part), units) if is_binary else _decode_line(part, segments, units)
-            if not np.abs(batch.time).max() < MAX_TIME:
-                raise ValueError(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
-            factors = np.repeat([known[stated[key]] for key, known in UNITS.items()], 3)
-            yield batch._replace(values=batch.values * factors)
+            yield _decode_line(line, segments, units)
         except ValueError as error:
             yield str(error)
 
 
-def _decode_packet(datagram: bytes) -> Batch:
-    try:
-        _, version, number, count, begin = HEADER.unpack_from(datagram)
-        (checksum,) = CRC.unpack(datagram[HEADER.size + count * SAMPLE.itemsize :])
-    except struct.error:
-        raise ValueError("binary packets of a wrong length") from None
-    if zlib.crc32(datagram[: -CRC.size]) != checksum:
-        raise ValueError("binary packets with a bad checksum")
-    if version != VERSION or number >= len(NUMBERS) or not count:
-        raise ValueError(f"binary packets of version {version} with {count} samples of the sensor with number {number}")
-    samples = np.frombuffer(datagram, SAMPLE, count, HEADER.size)
-    return Batch(NUMBERS[number], begin + samples["after"].astype(float), samples["values"].astype(float))
-
-
-def _decode_line(
-    line: bytes, segments: Collection[str] | None, units: Mapping[str, str]
-) -> tuple[Batch, Mapping[str, str]]:
-    """The samples of a line of JSON, and their units."""
+def _decode_line(line: bytes, segments: Collection[str] | None, units: Mapping[str, str]) -> Batch:
+    """The samples of a line of JSON; raises `ValueError` with the problem."""
     try:
         message = json.loads(line)
         sensor, battery = message["sensor"], _read_numbers(message.get("battery", math.nan)).item()
@@ -287,13 +256,17 @@ def _decode_line(
             raise ValueError("shapes")
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         raise ValueError(f"lines that are not as {JSON_LINE}") from None
-    is_name = isinstance(sensor, str) and 0 < len(sensor) <= MAX_NAME
+    is_name = isinstance(sensor, str) and 0 < len(sensor) <= LONGEST_NAME
     if not is_name or (segments is not None and sensor not in segments):
-        raise ValueError(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
+        raise ValueError(f"samples of an unknown sensor: {str(sensor)[:LONGEST_NAME]!r}")
     for key, known in UNITS.items():
         if stated[key] not in known:
-            raise ValueError(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
-    return Batch(sensor, time.reshape(-1), np.concatenate([gyro, accel], axis=-1).reshape(-1, 6), battery), stated
+            raise ValueError(f"JSON lines with {key} {stated[key][:LONGEST_NAME]!r}; {one_of(known)}")
+    if not np.abs(time).max() < MAX_TIME:
+        raise ValueError(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
+    gyro, accel = gyro * GYRO_UNITS[stated["gyro_unit"]], accel * ACCEL_UNITS[stated["accel_unit"]]
+    values = np.concatenate([gyro, accel], axis=-1)
+    return Batch(sensor, time.reshape(-1), values.reshape(-1, 6), battery)
 
 
 def _read_numbers(value: Any) -> np.ndarray:

@@ -218,8 +218,7 @@ function show(status) {
     text(row, "td", known(sensor.rate_hz, 0));
     text(row, "td", sensor.gyro_bias.map((axis) => known(begun ? degrees(axis) : null, 2).padStart(5, "\u2007")).join(" ")).className = "detail";
     text(row, "td", sensor.heading_std > UNKNOWN_HEADING ? "unknown" : known(degrees(sensor.heading_std), 1)).className = "detail";
-    text(row, "td", duration(begun ? sensor.heading_age : null)).className = "detail";
-    text(row, "td", sensor.missing + sensor.late, `never came: ${sensor.missing}, too late: ${sensor.late}`);
+    text(row, "td", sensor.missing);
     return row;
   }));
   const [half, most] = status.latency_ms;
