@@ -189,7 +189,7 @@ DEVICE = '[data]\nfile = "{}"\nformat = "{}"\n[sensors.torso]\n'
 WORDS = (
     b"nan", b"inf", b"-1e308", b"1e400", b"9" * 400, b"9" * 5000, b"0", b"-0.0", b"1_0", b"0x1p3", b"\xe2\x88\x921",
     *(bytes([c]) for c in b",;\t\n\"#\0[]{}=:'<>&"), b"\r\n", b"\xff\xfe", b"\xef\xbb\xbf", b"\x1b[31m",
-    b"true", b"null", b"[" * 2000, b"a." * 600, b"\\u001b", b"\\ud800", b"1979-05-27T07:32:00Z", b"../", b"/dev/zero",
+    b"true", b"null", b"a." * 600, b"\\u001b", b"\\ud800", b"1979-05-27T07:32:00Z", b"../", b"/dev/zero",
     b"<!DOCTYPE a [<!ENTITY b 'c'>]>", b"<!ENTITY % d SYSTEM 'http://127.0.0.1:9/d'>%d;", b"<![CDATA[", b"&#27;",
     b"encoding='utf-16'", b"type='floating'", b"<mimic joint='elbow'/>", b"<axis xyz='0 0 0'/>",
 )  # fmt: skip
