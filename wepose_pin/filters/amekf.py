@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arguments import NonNegative, Positive, PositiveOrInfinite, check_fields
+from ..arguments import NonNegative, Positive, PositiveOrInfinite
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
@@ -37,6 +37,7 @@ from .base import (
     RATE_VAR,
     START_HEADING_STD,
     STATIC_TURN_NOISE,
+    FilterParams,
     Orientation,
     OrientationFilter,
     bridge_rate,
@@ -92,7 +93,7 @@ BLOCK = np.dtype(
 
 
 @dataclass(frozen=True)
-class AmekfParams:
+class AmekfParams(FilterParams):
     """How wrong a MEMS sensor and how bounded a person's motion is; standard deviations for all recordings."""
 
     block_s: Positive = 0.25  # [s] between corrections; the covariance is propagated over it in one step
@@ -115,9 +116,6 @@ class AmekfParams:
     accel_bias_walk: NonNegative = 1e-4  # [m/s²/√s]
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it a rotation is as uncertain as a lost one
     lost_force_std: NonNegative = 5.0  # [m/s²] of the unknown acceleration while accel is lost (NaN)
-
-    def __post_init__(self) -> None:
-        check_fields(self, "")
 
 
 @kernel

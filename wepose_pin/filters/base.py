@@ -1,23 +1,21 @@
-"""What the orientation filters share: their protocol, their result, samples that were lost, runs in threads."""
+"""What the orientation filters share: their protocol, their result, samples that were lost."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..arguments import check_fields
 from ..compilation import inlined
 from ..diagnostics import Diagnostic, notebook_html
 from ..errors import BadData
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from .noise import SensorNoise
-
-T = TypeVar("T")
 
 # [rad/√s] by which a static sensor may rotate about the vertical undetected: 0.01 deg/s for 10 s at a time
 STATIC_TURN_NOISE = 8e-4
@@ -121,6 +119,13 @@ def _make_dtype(*fields: tuple[str, Any, tuple[int, ...]]) -> np.dtype:
     return np.dtype(list(fields), align=True)
 
 
+class FilterParams:
+    """Parameters of a filter, checked against their annotations."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "")
+
+
 class OrientationFilter:
     """A filter made for one sensor: ``Filter(noise, rate_hz, quat_VS, params)``.
 
@@ -210,20 +215,6 @@ def into_sensor(R, P, more, more_heading, out):  # type: ignore[no-untyped-def]
         out[i, i] = a * u + b * v + c * w + more
         for j in range(i):
             out[i, j] = out[j, i] = R[0, j] * u + R[1, j] * v + R[2, j] * w
-
-
-def run_in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:
-    """Return ``[function(*row) for row in zip(*columns)]``, computed in threads: one for each sensor's compiled run.
-
-    The runs release the interpreter's lock, so that `threads` of them run at once, by default as many as there are
-    processors. The order is that of the columns; the first error of a run is raised here.
-    """
-    rows = list(zip(*columns, strict=True))
-    workers = min(threads or count_processors(), len(rows))
-    if workers <= 1:
-        return [function(*row) for row in rows]
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda row: function(*row), rows))
 
 
 def count_processors() -> int:

@@ -19,46 +19,26 @@ def low_pass(values: np.ndarray, cutoff_hz: float, rate_hz: float, pad: int | No
     ----------
     pad : samples by which the signals are mirrored beyond their ends, fewer than n; None: as SciPy
     """
-    return _filter_both_ways(_design_low_pass(cutoff_hz, rate_hz), values, pad)
+    return _filter_both_ways(_design((None, cutoff_hz), rate_hz), values, pad)
 
 
 def band_pass(values: np.ndarray, band_hz: tuple[float, float], rate_hz: float) -> np.ndarray:
     """Signals (n, …) without what is slower or faster than `band_hz`."""
-    return _filter_both_ways(_design_band_pass(band_hz, rate_hz), values)
+    return _filter_both_ways(_design(band_hz, rate_hz), values)
 
 
-_POLES = np.exp(1j * np.pi * np.array([0.75, 1.25]))  # of the analogue low-pass filter of 1 rad/s
-_DOUBLE_RATE = 4.0  # of the bilinear transform at a rate of 2, as the frequencies are warped
-
-
-def _warp(frequency_hz: float, rate_hz: float) -> float:
-    return float(_DOUBLE_RATE * np.tan(np.pi * frequency_hz / rate_hz))
-
-
-def _design_low_pass(cutoff_hz: float, rate_hz: float) -> np.ndarray:
-    """Section (1, 6) b0, b1, b2, 1, a1, a2."""
-    cutoff = _warp(cutoff_hz, rate_hz)
-    poles = cutoff * _POLES
-    gain = cutoff**2 / float(np.prod(_DOUBLE_RATE - poles).real)
-    pole = (_DOUBLE_RATE + poles[0]) / (_DOUBLE_RATE - poles[0])
-    return np.array([[gain, 2.0 * gain, gain, 1.0, -2.0 * pole.real, abs(pole) ** 2]])
-
-
-def _design_band_pass(band_hz: tuple[float, float], rate_hz: float) -> np.ndarray:
-    """Sections (2, 6) b0, b1, b2, 1, a1, a2."""
-    low, high = (_warp(frequency_hz, rate_hz) for frequency_hz in band_hz)
-    half = 0.5 * (high - low) * _POLES
+def _design(band_hz: tuple[float | None, float], rate_hz: float) -> np.ndarray:
+    """Sections (k, 6) b0, b1, b2, 1, a1, a2, by the bilinear transform at a rate of 2 of warped frequencies."""
+    low, high = (0.0 if f is None else 4.0 * float(np.tan(np.pi * f / rate_hz)) for f in band_hz)
+    half = 0.5 * (high - low) * np.exp(0.75j * np.pi)  # pole of the analogue filter; its conjugate is one, too
     root = np.sqrt(half**2 - low * high)
-    poles = np.concatenate((half + root, half - root))
-    gain = float(((high - low) ** 2 * _DOUBLE_RATE**2 / np.prod(_DOUBLE_RATE - poles)).real)
-    digital = (_DOUBLE_RATE + poles) / (_DOUBLE_RATE - poles)
-    first, second = sorted(digital[digital.imag > 0.0], key=abs)
-    return np.array(
-        [
-            [gain, 2.0 * gain, gain, 1.0, -2.0 * first.real, abs(first) ** 2],
-            [1.0, -2.0, 1.0, 1.0, -2.0 * second.real, abs(second) ** 2],
-        ]
-    )
+    poles = np.array([2.0 * half] if band_hz[0] is None else [half + root, half - root])
+    gain = (high - low) ** 2 * 16.0 ** (len(poles) - 1) / np.prod(np.abs(4.0 - poles) ** 2)
+    digital = sorted((4.0 + poles) / (4.0 - poles), key=abs)
+    zeros = zip((2.0, -2.0), digital, strict=False)
+    sections = np.array([[1.0, b1, 1.0, 1.0, -2.0 * pole.real, abs(pole) ** 2] for b1, pole in zeros])
+    sections[0, :3] *= gain
+    return sections
 
 
 def _filter_both_ways(sections: np.ndarray, values: np.ndarray, pad: int | None = None) -> np.ndarray:
@@ -103,7 +83,7 @@ class BandPass:
     """A band-pass filter of signals that come in chunks, from the state settled at `first` (c,)."""
 
     def __init__(self, band_hz: tuple[float, float], rate_hz: float, first: np.ndarray) -> None:
-        self._sections = _design_band_pass(band_hz, rate_hz)
+        self._sections = _design(band_hz, rate_hz)
         self._state = _find_settled_state(self._sections, first)
 
     def push(self, values: np.ndarray) -> np.ndarray:

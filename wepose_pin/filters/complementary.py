@@ -16,32 +16,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arguments import NonNegative, check_fields
+from ..arguments import NonNegative
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import derivative, rotate_by_vector, up_in_sensor
-from .base import OrientationFilter, make_record
+from .base import FilterParams, OrientationFilter, make_record
 
 
 @dataclass(frozen=True)
-class NcfParams:
+class NcfParams(FilterParams):
     """Gains as tuned on many recordings by Laidig and Seel 2023 (VQF, Information Fusion 91, the Mahony baseline)."""
 
     proportional: NonNegative = 0.74  # [1/s] k_P
     integral: NonNegative = 0.0012  # [1/s²] k_I
 
-    def __post_init__(self) -> None:
-        check_fields(self, "")
-
 
 @dataclass(frozen=True)
-class GdcParams:
+class GdcParams(FilterParams):
     """The gain that Madgwick 2011 found best for an IMU."""
 
     gain: NonNegative = 0.033  # [1/s] β
-
-    def __post_init__(self) -> None:
-        check_fields(self, "")
 
 
 @inlined
@@ -105,7 +99,10 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias):  # type: 
             out_bias[k, i] = state.gyro_bias[i]
 
 
-class _Complementary(OrientationFilter):
+class Ncf(OrientationFilter):
+    """NCF of one sensor; the bias starts at the static phase's mean."""
+
+    params_type: type | None = NcfParams
     has_covariance, _run = False, staticmethod(_run)
 
     def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,13 +111,7 @@ class _Complementary(OrientationFilter):
         return state, make_record(dt=1.0 / self.rate_hz, **gains)
 
 
-class Ncf(_Complementary):
-    """NCF of one sensor; the bias starts at the static phase's mean."""
-
-    params_type = NcfParams
-
-
-class Gdc(_Complementary):
+class Gdc(Ncf):
     """GDC of one sensor; the bias is the static phase's mean."""
 
     params_type = GdcParams

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
 from .amekf import Amekf, AmekfParams
-from .base import Orientation, OrientationFilter, as_rows, make_orientation, run_in_parallel
+from .base import Orientation, OrientationFilter, as_rows, count_processors, make_orientation
 from .complementary import Gdc, Ncf
 from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
 from .phases import find_reference_phases
@@ -101,7 +102,16 @@ class SensorFilters:
         BadData
             The start phase has no gravity.
         """
-        orientations = run_in_parallel(lambda name: self._filter(name, chunk.imus[name], chunk.rate_hz), self.names)
+
+        def run(name: str) -> Orientation:
+            return self._filter(name, chunk.imus[name], chunk.rate_hz)
+
+        threads = min(count_processors(), len(self.names))
+        if threads > 1:  # compiled runs release the interpreter's lock
+            with ThreadPoolExecutor(threads) as pool:
+                orientations = list(pool.map(run, self.names))
+        else:
+            orientations = [run(name) for name in self.names]
         for i, each in enumerate(orientations):
             for name, values in each.sampled().items():
                 getattr(self._now, name)[i] = values[-1] if len(values) else getattr(self._now, name)[i]

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arguments import NonNegative, PositiveOrInfinite, check_fields
+from ..arguments import NonNegative, PositiveOrInfinite
 from ..compilation import fma, inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
@@ -31,6 +31,7 @@ from .base import (
     RATE_VAR,
     START_HEADING_STD,
     STATIC_TURN_NOISE,
+    FilterParams,
     OrientationFilter,
     bridge_rate,
     into_sensor,
@@ -40,16 +41,13 @@ from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S
 
 
 @dataclass(frozen=True)
-class SmekfParams:
+class SmekfParams(FilterParams):
     """What the static phase does not say of a sensor; standard deviations."""
 
     tilt_std: NonNegative = ACCEL_BIAS_STD  # [rad] of roll and pitch at the start
     static_turn_noise: NonNegative = STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical
     gyro_scale_std: NonNegative = 0.002  # of the gyroscope's scale, which no static phase shows
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
-
-    def __post_init__(self) -> None:
-        check_fields(self, "")
 
 
 # P is symmetric; each entry is computed once, with `fma`: that is most of the time of a step.

@@ -253,7 +253,7 @@ def build_recording(
             quat = bridge_quat(unpack_orientations(gyro[:, i], accel[:, i]), marks, clock)
             sensors[name] = OrientationSensor(quat, mount, gap, header["orientations"][name])
         else:
-            gyro_S = bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True)
+            gyro_S = bridge(np.ascontiguousarray(gyro[:, i]), marks, clock)
             sensors[name] = ImuSensor(gyro_S, bridge(np.ascontiguousarray(accel[:, i]), marks, clock), mount, gap)
     phases = {}
     for name, spans in header["phases"].items():

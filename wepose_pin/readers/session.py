@@ -269,7 +269,7 @@ def _bridge_gaps(measured: _Measured, faults: Sequence[Fault], gaps: bool) -> tu
     if "orientation" in signals:
         quat = bridge_quat(signals["orientation"], marks, clock)
         return OrientationSensor(quat, measured.mount, gap, measured.aligned), marks_reported
-    gyro_S = bridge(signals["gyro"], marks, clock, rate=True)
+    gyro_S = bridge(signals["gyro"], marks, clock)
     accel_S = bridge(signals["accel"], marks, clock)
     return ImuSensor(gyro_S, accel_S, measured.mount, gap), marks_reported
 

@@ -137,13 +137,9 @@ class StreamSynchronizer:
     A tick is complete as soon as every sensor has reached it. It waits `REORDER_S` for a sample that others of its
     sensor have overtaken and `wait_s` for a silent sensor, both measured on the samples' times. Then the sensor is
     lost, and ticks do not wait for it until its next sample. A sample at a tick is used unchanged. Between ticks the
-    rate is the mean over the step (a sample's rate holds for the interval that ends there) and the specific force is
-    interpolated. Gaps of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A noisy sensor is frozen when
-    it repeats its values for longer than that and for much longer than ever before, any sensor when it has never
-    changed while another one is noisy; its samples are lost until they change. An axis of gyro that stays at its
-    extreme after a steep rise is saturated: from then on, ticks with a rate at that level are NaN, because the rotation
-    is not known. Measured orientations between ticks are interpolated; they may repeat, as a device's own filter lets
-    them.
+    rate is the mean over the step, and specific force and measured orientations are interpolated. Gaps of up to
+    `LONGEST_GAP_S` are bridged linearly; longer ones are NaN. So are the samples of a frozen sensor until they change,
+    and ticks with a rate at which the gyroscope has saturated (`faults`).
 
     Parameters
     ----------
@@ -164,14 +160,11 @@ class StreamSynchronizer:
     ) -> None:
         self.sensors, self.rate_hz, self.begin, self.wait_s = tuple(sensors), rate_hz, begin, wait_s
         k = len(self.sensors)
-        self._sensors, self._clock = np.zeros(k, SENSOR), np.zeros(1, CLOCK)
-        self._sensors["is_orientation"] = [name in orientations for name in self.sensors]
-        self._sensors["saturation"] = start_saturation()
-        self._sensors["newest"] = -np.inf
-        self._clock[0] = (begin, 1.0 / rate_hz, wait_s, 0, -np.inf)
-        self.counts: np.ndarray = self._sensors["counts"]
-        self.lost: np.ndarray = self._sensors["lost"]
-        self.frozen: np.ndarray = self._sensors["frozen"]
+        self._clock = np.array([(begin, 1.0 / rate_hz, wait_s, 0, -np.inf)], CLOCK)
+        self._sensors = state = np.zeros(k, SENSOR)
+        state["is_orientation"] = [name in orientations for name in self.sensors]
+        state["saturation"], state["newest"] = start_saturation(), -np.inf
+        self.counts, self.lost, self.frozen = state["counts"], state["lost"], state["frozen"]
         # A sensor may be much faster than the ticks.
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
         self._buffers = np.zeros((k, room, _WIDTH))
@@ -281,22 +274,17 @@ def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
 def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-def]
     """Insert a sample into its sensor's buffer, in order of time."""
     dt, t, n = clock.dt, sample[_T], sensor.buffered
-    last = clock.begin + (clock.tick - 1.0) * dt  # time of the last complete tick
-    if t < last + SAME * dt:
-        # Only the first tick has no tick before it: a sample before the beginning is the start of its step.
-        if n > 0 and abs(buffer[0, _T] - t) < SAME * dt:
-            sensor.counts[DUPLICATE] += 1
-            return
-        if clock.tick > 0:
-            sensor.counts[LATE] += 1
-            if t > clock.newest - clock.wait_s:
-                sensor.lost = False  # the next tick waits for it again
-            return
     i = n
     while i > 0 and buffer[i - 1, _T] > t - SAME * dt:
         i -= 1
-    if i < n and abs(buffer[i, _T] - t) <= SAME * dt:
+    if i < n and buffer[i, _T] < t + SAME * dt:
         sensor.counts[DUPLICATE] += 1
+        return
+    # Only the first tick has no tick before it: a sample before the beginning is the start of its step.
+    if clock.tick > 0 and t < clock.begin + (clock.tick - 1.0 + SAME) * dt:
+        sensor.counts[LATE] += 1
+        if t > clock.newest - clock.wait_s:
+            sensor.lost = False  # the next tick waits for it again
         return
     if n == len(buffer):  # the sensor is ahead by a full buffer and no tick is complete: drop the oldest sample
         _drop(sensor, buffer, 1)

@@ -65,14 +65,11 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
     check_time(place, time)
     steps = np.diff(time)
     step = float(np.median(steps))
-    if step > LONGEST_STEP_S:
-        unit = guess_time_unit(step)
-        guess = f'; time_unit = "{unit}" would fit' if unit else ""
-        raise BadData(f"{place}: time grows by {step:g} s from row to row, slower than any body sensor{guess}")
-    if step < SHORTEST_STEP_S:
-        raise BadData(
-            f"{place}: time grows by {step:g} s from row to row, faster than any body sensor; is it in seconds?"
-        )
+    if not SHORTEST_STEP_S <= step <= LONGEST_STEP_S:
+        pace = "slower" if step > LONGEST_STEP_S else "faster"
+        unit = guess_time_unit(step) if step > LONGEST_STEP_S else None
+        guess = f'; time_unit = "{unit}" would fit' if unit else "; is it in seconds?"
+        raise BadData(f"{place}: time grows by {step:g} s from row to row, {pace} than any body sensor{guess}")
     wide = np.flatnonzero(steps > (1.0 + UNEVEN) * step)
     lost = np.round(steps[wide] / step) - 1.0
     if np.quantile(np.abs(steps / step - 1.0), 0.75) > REGULAR:
@@ -84,13 +81,14 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
             f"{place}: time jumps from {format_span(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
+    rows = np.arange(len(time), dtype=np.int32 if len(time) < 2**31 else np.int64)
     if not lost.any():
-        return Clock(time, np.arange(len(time), dtype=np.int32 if len(time) < 2**31 else np.int64), step, packet)
-    counts = np.zeros(len(time), dtype=int)
-    counts[wide] = lost.astype(int)
-    row = np.repeat(np.arange(len(time)), counts + 1)
-    nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself; lost rows after it count from 1
-    filled = time[row] + nth * np.append(steps / (counts[:-1] + 1), 0.0)[row]
+        return Clock(time, rows, step, packet)
+    counts = np.ones(len(time), dtype=int)  # of a row and the lost rows after it
+    counts[wide] += lost.astype(int)
+    row = np.repeat(rows, counts)
+    nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself
+    filled = time[row] + nth * np.append(steps / counts[:-1], 0.0)[row]
     return Clock(filled, np.where(nth == 0, row, -1), step, packet)
 
 
@@ -103,23 +101,19 @@ def _spread_packets(time: np.ndarray) -> tuple[int, np.ndarray]:
     if n < 4 * FEWEST_PACKETS or not np.isfinite(time).all() or (steps < 0.0).any():
         return 1, time
     mean = (time[-1] - time[0]) / (n - 1)
-    if np.median(steps) > WITHIN_PACKET * mean:
-        return 1, time
     ends = np.append(np.flatnonzero(steps > mean), n - 1)  # the last row of each packet
-    sizes = np.diff(ends, prepend=-1)
+    sizes, spans = np.diff(ends, prepend=-1), np.diff(time[ends])
     usual = int(np.median(sizes))
     if len(ends) < FEWEST_PACKETS or usual < 2 or np.mean(sizes == usual) < SAME_SIZE:
         return 1, time
-    spans = np.diff(time[ends])
     step = float(np.median(spans)) / usual
-    if step > LONGEST_STEP_S:
+    if step > LONGEST_STEP_S or np.median(steps) > WITHIN_PACKET * mean:
         return 1, time
     # After a lost packet the rows have the usual step.
     steps_within = np.append(step, np.where(spans < (1.0 + UNEVEN) * usual * step, spans / sizes[1:], step))
     arrival = time[ends]
     if sizes[-1] < usual:  # the recording ends within a packet: its rows continue from the packet before
-        arrival[-1] = min(arrival[-1], arrival[-2] + sizes[-1] * step)
-        steps_within[-1] = (arrival[-1] - arrival[-2]) / sizes[-1]
+        arrival[-1], steps_within[-1] = arrival[-2] + sizes[-1] * step, step
     packet = np.repeat(np.arange(len(ends)), sizes)
     return usual, arrival[packet] - steps_within[packet] * (ends[packet] - np.arange(n))
 
@@ -133,10 +127,9 @@ def guess_time_unit(step: float) -> str | None:
 
 
 def measure_rate(time: np.ndarray) -> float:
-    """Measure the mean rate [Hz] of even times (n,) [s].
+    """Measure the mean rate [Hz] of even times (n,) [s], to a thousandth where the times are rounded by as much.
 
-    It is rounded to a thousandth where that is within the rounding of the times: 1.7e9 s are written to 0.2 µs, by
-    which 100 Hz over half a minute are 1e-6 Hz off, and what counts samples would round halves differently.
+    1.7e9 s are written to 0.2 µs, by which 100 Hz over half a minute are 1e-6 Hz off.
     """
     duration = float(time[-1] - time[0])
     rate_hz = (len(time) - 1) / duration
@@ -155,10 +148,9 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     BadData
         The clocks do not overlap.
     """
-    first = next(iter(clocks.values()))
     distinct = list({id(clock): clock for clock in clocks.values()}.values())  # usually one for all sensors
-    steps = [np.diff(clock.time) for clock in distinct]
-    uneven = max(float(np.max(np.abs(each / clock.step - 1.0))) for clock, each in zip(distinct, steps, strict=True))
+    first, steps = distinct[0], [np.diff(clock.time) for clock in distinct]
+    uneven = max(float(np.abs(each / clock.step - 1.0).max()) for clock, each in zip(distinct, steps, strict=True))
     drift = max(_compute_drift(clock.time) for clock in distinct)
     shared = all(
         len(clock.time) == len(first.time)
@@ -167,9 +159,8 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     )
     if shared and uneven <= UNEVEN + 1e-9 and drift <= DRIFT:
         return first.time, ()
-    begin = max(float(clock.time[0]) for clock in clocks.values())
-    end = min(float(clock.time[-1]) for clock in clocks.values())
-    usual = max(float(clock.time[-1] - clock.time[0]) / (len(clock.time) - 1) for clock in clocks.values())
+    begin, end = max(float(clock.time[0]) for clock in distinct), min(float(clock.time[-1]) for clock in distinct)
+    usual = max(float(each.mean()) for each in steps)
     if end - begin < 2.0 * usual:
         spans = ", ".join(f"{name} {format_span(c.time[[0, -1]])}" for name, c in clocks.items())
         raise BadData(
@@ -177,10 +168,10 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
         )
     dt = 1.0 / float(np.round(1.0 / usual, 3 if usual < 0.1 else 6))
     time = np.minimum(begin + dt * np.arange(int((end - begin) / dt + 1e-6) + 1), end)
-    shortest, longest = min(float(each.min()) for each in steps), max(float(each.max()) for each in steps)
+    facts: dict[str, float | str] = {"start": begin, "end": float(time[-1]), "rate": 1.0 / dt}
+    facts |= {"shortest": min(float(each.min()) for each in steps), "longest": max(float(each.max()) for each in steps)}
     variant, off = ("uneven", uneven) if uneven > UNEVEN else ("changing", drift)
-    facts: dict[str, float | str] = {"start": begin, "end": float(time[-1]), "shortest": shortest, "longest": longest}
-    facts |= {"variant": variant if shared else "clocks", "rate": 1.0 / dt}
+    facts["variant"] = variant if shared else "clocks"
     return time, (Diagnostic("time-stamps-uneven", INFO, value=off if shared else None, facts=facts),)
 
 

@@ -2,7 +2,7 @@
 
 A sample is lost when its row is missing (a long step in time) or its cells are empty. Gaps of up to
 `clocks.LONGEST_GAP_S` are bridged: rate and specific force linearly, measured orientations along the shortest rotation.
-A longer gap is an error, or is bridged and marked where the user allows it.
+A longer gap is an error, or is bridged and marked where the user allows it: filters take no sample in it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from .. import rotations
 from .clocks import UNEVEN, Clock
 from .sensors import OrientationSensor, Sensor
-
-# In a long gap the rate fades to the static sensor's rate within this time [s]: a movement lasts no longer.
-FADE_S = 0.1
 
 GOOD, BRIDGED, LONG = 0, 1, 2
 
@@ -36,28 +33,14 @@ def find_runs(which: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = False) -> np.ndarray:
-    """Fill lost samples of `values` (n, k) linearly in time; at the ends with the nearest value.
-
-    With `rate` the values are angular rates,
-    which in long gaps fade to the rate of the static sensor, its bias.
-    """
+def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
+    """Fill lost samples of `values` (n, k) linearly in time; at the ends with the nearest value."""
     lost = marks != GOOD
     if not lost.any():
         return values
-    time, filled = clock.time, values.copy()
+    filled = values.copy()
     for k in range(values.shape[1]):
-        filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
-    if rate and (marks == LONG).any():
-        second = find_static_second(values, ~lost, 1.0 / clock.step)
-        static = values[second].mean(axis=0) if len(second) else np.zeros(values.shape[1])
-        for first, last in find_runs(marks == LONG):
-            edges = [edge for edge in (first - 1, last) if 0 <= edge < len(time)]
-            near = [np.clip(1.0 - np.abs(time[first:last] - time[edge]) / FADE_S, 0.0, None) for edge in edges]
-            whole = np.maximum(1.0, np.sum(near, axis=0))
-            filled[first:last] = static
-            for edge, weight in zip(edges, near, strict=True):
-                filled[first:last] += (weight / whole)[:, None] * (values[edge] - static)
+        filled[lost, k] = np.interp(clock.time[lost], clock.time[~lost], values[~lost, k])
     return filled
 
 
@@ -72,19 +55,6 @@ def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray
         turn = Slerp(clock.time[edges], Rotation.from_quat(quat[edges]))
         filled[first:last] = turn(clock.time[first:last]).as_quat()
     return filled
-
-
-def find_static_second(gyro_S: np.ndarray, good: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Find the samples of the second, without any that is not `good` (n,), in which the rate (n, 3) varies least.
-
-    They are none where each second has a sample that is not good.
-    """
-    size = min(len(gyro_S), max(2, round(rate_hz)))
-    count = len(gyro_S) // size
-    motion = gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
-    motion[~good[: count * size].reshape(count, size).all(axis=1)] = np.inf
-    first = int(np.argmin(motion))
-    return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
 # Resampling, which preserves total rotation --------------------------------------------------------------------------
@@ -111,20 +81,10 @@ def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
     if dt < (1.0 + UNEVEN) * float(np.median(np.diff(clock))):
         accel = np.column_stack([np.interp(within, clock, axis) for axis in sensor.accel_S.T])
     else:
-        accel = _average(sensor.accel_S, clock, within, dt)
+        # A mean over each step is the difference of integrals at its ends.
+        trapezes = 0.5 * (sensor.accel_S[1:] + sensor.accel_S[:-1]) * np.diff(clock)[:, None]
+        integral = np.concatenate([np.zeros((1, 3)), np.cumsum(trapezes, axis=0)])
+        first, last = (np.clip(time + side * dt / 2.0, clock[0], clock[-1]) for side in (-1.0, 1.0))
+        accel = np.column_stack([np.interp(last, clock, axis) - np.interp(first, clock, axis) for axis in integral.T])
+        accel /= (last - first)[:, None]
     return replace(sensor, gyro_S=np.concatenate([rate[:1], rate]), accel_S=accel, gap=gap)
-
-
-def _average(values: np.ndarray, clock: np.ndarray, time: np.ndarray, width: float) -> np.ndarray:
-    """Average (m, k) the piecewise linear signal over `width` [s] around each time; shorter at the clock's ends."""
-    trapezes = 0.5 * (values[1:] + values[:-1]) * np.diff(clock)[:, None]
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(trapezes, axis=0)])
-    first, last = (np.clip(time + side * width / 2.0, clock[0], clock[-1]) for side in (-1.0, 1.0))
-
-    def integrate_to(t: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(clock, t, side="right") - 1, 0, len(clock) - 2)
-        part = (t - clock[k])[:, None]
-        slope = (values[k + 1] - values[k]) / (clock[k + 1] - clock[k])[:, None]
-        return integral[k] + part * (values[k] + 0.5 * part * slope)
-
-    return (integrate_to(last) - integrate_to(first)) / (last - first)[:, None]

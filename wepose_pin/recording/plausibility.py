@@ -12,7 +12,6 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
 from ..rotations import unroll
 from .faults import find_saturation
-from .gaps import find_static_second
 from .intervals import format_span
 from .limits import (
     GRAVITY_ERROR_NOTED,
@@ -75,7 +74,7 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
     else:
         good = (np.abs(sensor.gyro_S) < sensor.gyro_range).all(axis=1)  # a rate at the limit varies least of all
         good = good if sensor.gap is None else good & ~sensor.gap
-        static = find_static_second(sensor.gyro_S, good, recording.rate_hz)
+        static = _find_static_second(sensor.gyro_S, good, recording.rate_hz)
         when = "in the second in which it turns most evenly"
     if len(static) < 2:
         return []
@@ -102,6 +101,19 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
         return []
     facts = {"norm": norm, "start": first, "end": last}
     return [Diagnostic("accel-scale", WARNING, segment, share, GRAVITY_ERROR_NOTED, facts)]
+
+
+def _find_static_second(gyro_S: np.ndarray, good: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Find the samples of the second, without any that is not `good` (n,), in which the rate (n, 3) varies least.
+
+    They are none where each second has a sample that is not good.
+    """
+    size = min(len(gyro_S), max(2, round(rate_hz)))
+    count = len(gyro_S) // size
+    motion = gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
+    motion[~good[: count * size].reshape(count, size).all(axis=1)] = np.inf
+    first = int(np.argmin(motion))
+    return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
 def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:

@@ -132,6 +132,7 @@ class Recording:
         """
         check_value("rate_hz", rate_hz, Positive)
         built: dict[str, Sensor] = {}
+        count = 0
         for segment, values in sensors.items():
             mount = None
             if mounts and segment in mounts:
@@ -143,13 +144,11 @@ class Recording:
                 built[segment] = ImuSensor(*values, mount)
             else:
                 raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
-        first = next(iter(sensors.values()), ())
-        count = len(first[0] if isinstance(first, tuple) and first else first)
-        time = np.arange(count) / rate_hz
-        return cls(name, time, rate_hz, built, phases or {}).check()
+            count = count or len(values[0] if isinstance(values, tuple) else values)
+        return cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check()
 
     def check(self) -> Recording:
-        """Check a recording that was built in code, as `check_recording`, and its unit of specific force; return it."""
+        """Check a recording that was built in code, as `check_recording`, and its unit of force; return it."""
         check_recording(self)
         for segment, sensor in self.imus.items():
             force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
@@ -249,7 +248,18 @@ def check_recording(recording: Recording) -> Recording:
         raise BadData(f"{where}: time has {len(time)} samples; a recording has at least 2")
     check_array(f"{where}: time", time, (len(time),))
     check_time(where, time)
-    _check_rate(where, time, recording.rate_hz)
+    steps, seconds = len(time) - 1, float(time[-1] - time[0])
+    if abs(seconds * recording.rate_hz - steps) > max(1.0, RATE_ERROR * steps):
+        raise BadData(
+            f"{where}: rate_hz = {recording.rate_hz:g}, and time has {steps / seconds:.6g} samples a second; they must "
+            f"agree to {100.0 * RATE_ERROR:g} %"
+        )
+    k = int(np.argmax(np.diff(time)))
+    if (time[k + 1] - time[k]) * recording.rate_hz > LONGEST_STEP:
+        raise BadData(
+            f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {recording.rate_hz:g} Hz; "
+            f"fill or cut the gap first"
+        )
     if not all(0 <= tick < len(time) for tick in recording.resets):
         raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
     for segment, sensor in recording.sensors.items():
@@ -261,11 +271,11 @@ def check_recording(recording: Recording) -> Recording:
 def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
     """Check that each array has a finite row for each time (n,) [s], and that quaternions have unit norm."""
     if isinstance(sensor, ImuSensor):
-        arrays = {"gyro": (sensor.gyro_S, 3), "accel": (sensor.accel_S, 3)}
+        arrays = {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
     else:
-        arrays = {"orientation": (sensor.quat_VS, 4)}
-    for name, (values, width) in arrays.items():
-        check_array(f"{place}.{name}", values, (len(time), width), rows=EACH_TIME)
+        arrays = {"orientation": sensor.quat_VS}
+    for name, values in arrays.items():
+        check_array(f"{place}.{name}", values, (len(time), 4 if name == "orientation" else 3), rows=EACH_TIME)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if bad.size:
             raise BadData(
@@ -278,20 +288,3 @@ def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
         check_numbers(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
     if sensor.gap is not None:
         check_array(f"{place}.gap", sensor.gap, (len(time),), "b", EACH_TIME)
-
-
-def _check_rate(where: str, time: np.ndarray, rate_hz: float) -> None:
-    """Check that times (n,) [s] increase evenly at the rate, jitter aside."""
-    steps = len(time) - 1
-    stated = (time[-1] - time[0]) * rate_hz
-    if abs(stated - steps) > max(1.0, RATE_ERROR * steps):
-        raise BadData(
-            f"{where}: rate_hz = {rate_hz:g}, and time has {steps / (time[-1] - time[0]):.6g} samples a second; they "
-            f"must agree to {100.0 * RATE_ERROR:g} %"
-        )
-    k = int(np.argmax(np.diff(time)))
-    if (time[k + 1] - time[k]) * rate_hz > LONGEST_STEP:
-        raise BadData(
-            f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {rate_hz:g} Hz; fill or cut "
-            f"the gap first"
-        )

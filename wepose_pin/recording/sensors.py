@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -103,14 +104,10 @@ Sensor = ImuSensor | OrientationSensor
 
 def join_sensors(parts: Sequence[Sensor]) -> Sensor:
     """Join consecutive parts of one sensor; mount and range are those of the last part."""
-    gaps = [part.gap for part in parts if part.gap is not None]
-    gap = np.concatenate(gaps) if len(gaps) == len(parts) else None
-    if isinstance(parts[-1], ImuSensor):
-        imus = [part for part in parts if isinstance(part, ImuSensor)]
-        gyro_S, accel_S = np.concatenate([s.gyro_S for s in imus]), np.concatenate([s.accel_S for s in imus])
-        return replace(imus[-1], gyro_S=gyro_S, accel_S=accel_S, gap=gap)
-    fused = [part for part in parts if isinstance(part, OrientationSensor)]
-    return replace(fused[-1], quat_VS=np.concatenate([s.quat_VS for s in fused]), gap=gap)
+    signals = ("gyro_S", "accel_S") if isinstance(parts[-1], ImuSensor) else ("quat_VS",)
+    names = (*signals, "gap") if all(part.gap is not None for part in parts) else signals
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[-1], **{"gap": None} | joined)
 
 
 def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:

@@ -93,7 +93,7 @@ class Simulation:
             marks = mark_lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
             stated = self.stated_mount[segment]
             sensors[segment] = ImuSensor(
-                gyro_S=bridge(gyro_S, marks, clock, rate=True),
+                gyro_S=bridge(gyro_S, marks, clock),
                 accel_S=bridge(self.accel_S[segment], marks, clock),
                 stated_quat_LS=None if stated is None else compute_mount(*stated),
             )
