@@ -16,11 +16,10 @@ from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
 from ..recording.faults import find_faults, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
-from .amekf import Amekf, AmekfParams
-from .base import Orientation, OrientationFilter, join_orientations
-from .complementary import Gdc, GdcParams, Ncf, NcfParams
+from .amekf import AmekfParams
+from .base import Orientation, join_orientations
+from .complementary import GdcParams, NcfParams
 from .noise import TYPICAL, SensorNoise, estimate_noise
-from .published import PublishedSmekf
 from .sensors import (
     BEST,
     METHODS,
@@ -30,8 +29,7 @@ from .sensors import (
     check_method,
     run_filter,
 )
-from .smekf import Smekf, SmekfParams
-from .smoother import Smoother
+from .smekf import SmekfParams
 from .static import StaticTest
 
 __all__ = [
@@ -40,19 +38,12 @@ __all__ = [
     "OFFLINE",
     "STATIC_ONLY",
     "TYPICAL",
-    "Amekf",
     "AmekfParams",
-    "Gdc",
     "GdcParams",
-    "Ncf",
     "NcfParams",
     "Orientation",
-    "OrientationFilter",
-    "PublishedSmekf",
     "SensorFilters",
-    "Smekf",
     "SmekfParams",
-    "Smoother",
     "check_method",
     "estimate_orientation",
     "join_orientations",

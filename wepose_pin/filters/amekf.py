@@ -44,7 +44,6 @@ from .base import (
     into_sensor,
     make_record,
 )
-from .noise import SensorNoise
 
 
 class ErrorStates(NamedTuple):
@@ -169,23 +168,16 @@ def _propagate(state, model):  # type: ignore[no-untyped-def]
         for j in range(PROPAGATED_STATES):
             P[i, j] = 0.5 * (corner[i, j] + corner[j, i])
 
-    dt, length = model.dt, block.length
-    attitude_var = model.gyro_noise_psd * length + model.rate_noise_psd * state.rate_squared * dt
-    velocity_var = model.accel_noise_psd * length + model.force_error_var * (state.acceleration_sum * dt) ** 2
+    dt = model.dt
+    attitude_var = block.lost_rotation_var + model.rate_noise_psd * state.rate_squared * dt
+    velocity_var = model.force_error_var * (state.acceleration_sum * dt) ** 2
     velocity_var += (state.impact_excess * dt) ** 2 + model.lost_accel_var * state.lost_accel_s**2
-    _add_variance(P, ERROR.attitude, attitude_var + block.lost_rotation_var)
-    _add_variance(P, ERROR.velocity, velocity_var)
-    _add_variance(P, ERROR.gyro_bias, model.bias_walk * length)
-    _add_variance(P, ERROR.gyro_matrix, model.matrix_walk * length)
-    _add_variance(P, ERROR.accel_bias, model.accel_bias_walk * length)
-    _add_variance(P, ERROR.motion_bias, model.motion_bias_walk * length)
-
-
-@inlined
-def _add_variance(P, states, variance):  # type: ignore[no-untyped-def]
-    """Add a variance to each of a range of states."""
-    for i in range(states.start, states.stop):
-        P[i, i] += variance
+    for i in range(STATES):
+        P[i, i] += model.noise_psd[i] * block.length
+    for i in range(3):
+        P[i, i] += attitude_var
+    P[VELOCITY, VELOCITY] += velocity_var
+    P[VELOCITY + 1, VELOCITY + 1] += velocity_var
 
 
 @inlined
@@ -290,23 +282,6 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Compute the sample's horizontal acceleration in V, two floats [m/s²]; zero for a lost sample."""
-    bias, R = state.x[ERROR.accel_bias], state.R_VS
-    if not ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
-        state.lost_accel_s += model.dt
-        return 0.0, 0.0
-    fx, fy, fz = ax - bias[0], ay - bias[1], az - bias[2]
-    ax = R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz
-    ay = R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz
-    az = R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz - model.gravity
-    size = np.sqrt(ax * ax + ay * ay + az * az)
-    state.acceleration_sum += size
-    state.impact_excess += max(0.0, size - model.impact_limit)
-    return ax, ay
-
-
-@inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]. Return whether a block ended."""
     dt, x, R, block, bias = model.dt, state.x, state.R_VS, state.block, state.gyro_bias
@@ -335,13 +310,21 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
             block.R_rate[1, i, c] = began * block.R_rate[1, i, c] + R_dt * uy
             block.R_rate[2, i, c] = began * block.R_rate[2, i, c] + R_dt * uz
             block.R_moving[i, c] = began * block.R_moving[i, c] + R_dt * moving
-    ax, ay = _compute_horizontal_acceleration(state, model, ax, ay, az)
-    velocity, position = x[ERROR.velocity], x[ERROR.position]
+    velocity, position, force_bias = x[ERROR.velocity], x[ERROR.position], x[ERROR.accel_bias]
     position[0] += dt * velocity[0]
     position[1] += dt * velocity[1]
-    velocity[0] += dt * ax
-    velocity[1] += dt * ay
-
+    if ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
+        fx, fy, fz = ax - force_bias[0], ay - force_bias[1], az - force_bias[2]
+        ax = R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz
+        ay = R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz
+        az = R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz - model.gravity
+        size = np.sqrt(ax * ax + ay * ay + az * az)
+        state.acceleration_sum += size
+        state.impact_excess += max(0.0, size - model.impact_limit)
+        velocity[0] += dt * ax
+        velocity[1] += dt * ay
+    else:
+        state.lost_accel_s += dt
     state.samples += 1
     ended = state.samples == model.block_samples
     if ended:
@@ -422,37 +405,37 @@ class Amekf(OrientationFilter):
             measured=np.zeros(3),
             innovation=np.zeros(3),
         )
-        return state, _build_model(noise, rate_hz, max(1, round(p.block_s * rate_hz)), p)
+        block_samples = max(1, round(p.block_s * rate_hz))
+        length = block_samples / rate_hz
+        gyro_var, accel_var = float(np.trace(noise.gyro_cov)) / 3.0, float(np.trace(noise.accel_cov)) / 3.0
+        noise_psd = np.zeros(STATES)
+        noise_psd[ERROR.attitude], noise_psd[ERROR.velocity] = (
+            gyro_var / rate_hz,
+            accel_var * noise.gravity**2 / rate_hz,
+        )
+        noise_psd[ERROR.gyro_bias], noise_psd[ERROR.gyro_matrix] = p.gyro_bias_walk**2, p.gyro_matrix_walk**2
+        noise_psd[ERROR.accel_bias], noise_psd[ERROR.motion_bias] = p.accel_bias_walk**2, p.motion_bias_walk**2
+        # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
+        white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
+        model = make_record(
+            dt=1.0 / rate_hz,  # [s]
+            block_samples=np.int64(block_samples),
+            gravity=noise.gravity,  # [m/s²]
+            noise_psd=noise_psd,  # (25,) by which the variance of each state grows in a second
+            velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
+            position_var=p.position_std**2 * p.motion_s / length,  # [m²]
+            static_velocity_var=p.static_speed_std**2,  # [m²/s²]
+            static_bias_var=p.static_bias_std**2 + white + sway / length,  # [rad²/s²] of gyro's mean about the bias
+            # [rad²/s] A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
+            static_heading_psd=p.static_turn_noise**2 + sway / 8.0,
+            rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
+            force_error_var=p.force_noise**2,  # [1] of the summed |acceleration| of a block
+            lost_accel_var=p.lost_force_std**2,  # [m²/s⁴]
+            gyro_range=p.gyro_range,  # [rad/s]
+            impact_limit=p.impact,  # [m/s²]
+        )
+        return state, model
 
     def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
         arrays = out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical
         return partial(_run, self.state, self.model, gyro_S, accel_S, out.static, self.blocks, *arrays)
-
-
-def _build_model(noise: SensorNoise, rate_hz: float, block_samples: int, p: AmekfParams) -> np.ndarray:
-    """Build the coefficients of a block, a record (1,)."""
-    length = block_samples / rate_hz
-    # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
-    white, sway = float(np.trace(noise.gyro_cov)) / 3.0 / block_samples, noise.sway_density(rate_hz)
-    return make_record(
-        dt=1.0 / rate_hz,  # [s]
-        block_samples=np.int64(block_samples),
-        gravity=noise.gravity,  # [m/s²]
-        gyro_noise_psd=float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,  # [rad²/s]
-        accel_noise_psd=float(np.trace(noise.accel_cov)) / 3.0 * noise.gravity**2 / rate_hz,  # [m²/s³]
-        velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
-        position_var=p.position_std**2 * p.motion_s / length,  # [m²]
-        static_velocity_var=p.static_speed_std**2,  # [m²/s²]
-        static_bias_var=p.static_bias_std**2 + white + sway / length,  # [rad²/s²] of the mean of gyro about the bias
-        # [rad²/s] A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
-        static_heading_psd=p.static_turn_noise**2 + sway / 8.0,
-        rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
-        force_error_var=p.force_noise**2,  # [1] of the summed |acceleration| of a block
-        bias_walk=p.gyro_bias_walk**2,  # [rad²/s³]
-        matrix_walk=p.gyro_matrix_walk**2,  # [1/s]
-        accel_bias_walk=p.accel_bias_walk**2,  # [m²/s⁵]
-        motion_bias_walk=p.motion_bias_walk**2,  # [rad²/s³]
-        lost_accel_var=p.lost_force_std**2,  # [m²/s⁴]
-        gyro_range=p.gyro_range,  # [rad/s]
-        impact_limit=p.impact,  # [m/s²]
-    )

@@ -132,12 +132,11 @@ class StaticDetector:
         self._tail = np.zeros((n, SUMS))  # sums of the block before, from each of its samples to its end
         self._state = make_record(
             samples=np.int64(0),  # in the current block
-            has_block=np.bool_(False),  # there is a block before it
             anchor=np.zeros(SIGNALS),  # the last sample of the block before
             head=np.zeros(SUMS),  # sums of the current block so far, while it does not move
             window=np.zeros(SUMS),  # sums of the window
             moves=np.bool_(False),  # a sample of the block is too far from the anchor for any static window
-            moves_until=np.int64(-1),  # of the block before, the last sample that is; `tail` begins after it
+            moves_until=np.int64(n),  # of the block before, the last sample that is; `tail` begins after it
             bias=noise.gyro_bias,  # [rad/s] the known bias of condition (5)
             bias_var=np.trace(noise.gyro_bias_cov) / 3.0,  # [rad²/s²]
             average_rate=0.0,  # [rad/s] about the vertical, beyond the known bias
@@ -252,11 +251,11 @@ def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ign
     state.samples = at + 1
     if state.samples < len(block):
         if not state.moves:
-            state.moves = state.has_block and _is_far(anchor, limit, block, at)
+            state.moves = _is_far(anchor, limit, block, at)
             _add(head, head, block, at, anchor)
             # No window needs the sums of the block before from here; those up to here serve condition (6).
             tail[at, 0], tail[at, 1], tail[at, 2] = head[0], head[1], head[2]
-        return -1 if state.moves or not state.has_block or state.samples <= state.moves_until else state.samples
+        return -1 if state.moves or state.samples <= state.moves_until else state.samples
     # The block is full and is the window: sum it up backwards, begin the next.
     if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
         for m in range(SIGNALS):
@@ -264,7 +263,7 @@ def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ign
     for m in range(SUMS):
         head[m] = 0.0
     _add(tail[at], head, block, at, anchor)
-    state.moves, state.moves_until, state.samples, state.has_block = False, -1, 0, True
+    state.moves, state.moves_until, state.samples = False, -1, 0
     for before in range(at - 1, -1, -1):
         if _is_far(anchor, limit, block, before):
             state.moves_until = before

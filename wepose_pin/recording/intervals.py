@@ -43,19 +43,18 @@ def check_time(where: str, time: np.ndarray) -> None:
 
 def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
     """Check that every interval [s] has a positive length and lies in the recording, to `MOST_BEYOND` samples."""
-    beyond = _find_slack(time)
     for name, intervals in phases.items():
         for first, last in intervals:
             place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"
             if not first < last:
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
-            if first < time[0] - beyond or last > time[-1] + beyond:
+            if _is_beyond(time, first, last):
                 raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:.3f} to {time[-1]:.3f} s")
 
 
-def _find_slack(time: np.ndarray) -> float:
-    """Find the time [s] by which an interval may exceed the recording at each end."""
-    return MOST_BEYOND * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+def _is_beyond(time: np.ndarray, first: float, last: float) -> bool:
+    slack = MOST_BEYOND * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    return bool(first < time[0] - slack or last > time[-1] + slack)
 
 
 # What the options --interval and --phase select ----------------------------------------------------------------------
@@ -94,11 +93,9 @@ def select_interval(
     check_selection(interval, phase)
     if phase is not None:
         return _find_phase(phases, phase)
-    if interval is not None:
-        beyond = _find_slack(time)
-        if interval[0] < time[0] - beyond or interval[1] > time[-1] + beyond:
-            shown = f"{format_time(interval[0])} {format_time(interval[1])}"
-            raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
+    if interval is not None and _is_beyond(time, *interval):
+        shown = f"{format_time(interval[0])} {format_time(interval[1])}"
+        raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
     return interval
 
 
