@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, a_pose, write_folder
 from test_export_robot import place_by_pinocchio, read_positions, write_trajectory_folder
 
-from wepose_pin import BadOption, Pose, export, load_model
+from wepose_pin import Pose, WeposeError, export, load_model
 from wepose_pin.body.configuration import solve_configuration
 from wepose_pin.body.links import compute_link_poses
 
@@ -155,7 +155,7 @@ def test_without_its_package_a_format_says_which(
     result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(BadOption, match=f"pip install {package}"):
+    with pytest.raises(WeposeError, match=f"pip install {package}"):
         export(result, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 

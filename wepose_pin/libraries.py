@@ -58,7 +58,7 @@ def check_file(path: Path, kind: str) -> None:
         raise MissingFile(f"{path}: {found}; {kind} is wanted here")
 
 
-def import_library(module: str, path: Path, kind: str) -> Any:
+def import_library(module: str, path: Path | str, kind: str) -> Any:
     """Import a module of an optional package, which reads `path`, a `kind` such as "a C3D"; else raise `BadData`."""
     try:
         return importlib.import_module(module)

@@ -368,15 +368,13 @@ def _propose_rate(proposal: _Proposal, dates: pl.DataFrame, lines: Sequence[str]
                 ticks = texts.str.strptime(kind, form, strict=False).cast(pl.Int64).drop_nulls().to_numpy()
                 if len(ticks) and (span := float(np.ptp(ticks)) * tick_s):
                     rate_hz = proposal.data["rate_hz"] = float(f"{(len(ticks) - 1) / span:.6g}")
-                    fact = f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz"
-                    proposal.facts.append(fact)
+                    proposal.facts.append(f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz")
                     return
-    stated = next(filter(None, map(_STATED_RATE.search, lines)), None)
-    proposal.data["rate_hz"] = float(stated["rate"]) if stated else ASSUMED_RATE_HZ
-    if stated:
+    if stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
+        proposal.data["rate_hz"] = float(stated["rate"])
         proposal.facts.append(f"no column looks like time; the file says '{stated[0]}'")
     else:
-        proposal.checks["rate_hz"] = "no column looks like time"
+        proposal.data["rate_hz"], proposal.checks["rate_hz"] = ASSUMED_RATE_HZ, "no column looks like time"
 
 
 # Text of the session ---------------------------------------------------------------------------------------------
@@ -419,11 +417,7 @@ def _format_session(proposal: _Proposal, model: Path | None, recording: Recordin
     lines = [*format_keys({**head, "start_pose": "n_pose"}), "", "[data]", *format_keys(proposal.data, proposal.checks)]
     lines += ["", "[phases]   # seconds"]
     if proposal.phases:  # as they were marked live
-        inside = {
-            name: [(np.ceil(1e3 * a) / 1e3, np.floor(1e3 * b) / 1e3) for a, b in spans]
-            for name, spans in proposal.phases.items()
-        }
-        lines += format_keys(inside)
+        lines += format_keys(proposal.phases)
     elif recording is not None:
         lines += _propose_phases(proposal, recording, static)
     for segment in sorted(proposal.sensors, key=lambda name: segments.index(name) if name in segments else 99):

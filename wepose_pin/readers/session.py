@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -41,8 +41,6 @@ from .session_file import (
     read_sensor_keys,
     read_session_file,
 )
-
-T = TypeVar("T")
 
 NORM_ERROR = 1e-2  # of a quaternion, from rounded decimals
 MOST_LOST = 0.01  # share of samples lost in short gaps, above which it is a diagnostic
@@ -90,7 +88,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
     check_phases(str(path), time, head.phases)
     start = next(iter(head.phases.get("start", ())), None)
-    samples = {segment: each.list_samples() for segment, each in measured.items()}
+    samples = {name: (each.clock.time[each.clock.row >= 0], *each.values.values()) for name, each in measured.items()}
     faults, gyro_range, frozen = check_sensors(str(path), samples, start)
     sensors: dict[str, Sensor] = {}
     diagnostics = [*resampled, *files.diagnostics, *frozen]
@@ -114,13 +112,6 @@ class _Measured(NamedTuple):
     values: Mapping[str, np.ndarray]  # signal → (n, k) in SI, of the rows of the file
     mount: np.ndarray | None  # (4,) xyzw, sensor to segment; None: not stated
     aligned: bool  # its orientations are the segment's own
-
-    def list_samples(self) -> tuple[np.ndarray, ...]:
-        """List the times (n,) [s] of the file's rows, and the values of each signal."""
-        clock = self.clock
-        # Without lost rows no copy is made.
-        time = clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
-        return (time, *self.values.values())
 
 
 # Files -------------------------------------------------------------------------------------------------------------
@@ -196,7 +187,9 @@ class _Files:
             units[signal] = known.get(unit, 1.0)
         columns = dict(keys.signals)
         if is_array_file(path):
-            file = _open(self._arrays, ArrayFile, path)
+            if path not in self._arrays:
+                self._arrays[path] = ArrayFile(path)
+            file = self._arrays[path]
             for signal, names in columns.items():
                 if len(names) == 1:
                     columns[signal] = file.expand(names[0], WIDTHS[signal], table.at(signal))
@@ -205,7 +198,9 @@ class _Files:
         else:
             for signal in (signal for signal, names in columns.items() if len(names) == 1):
                 table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
-            content = _open(self.tables, read_table, path)
+            if path not in self.tables:
+                self.tables[path] = read_table(path)
+            content = self.tables[path]
         if keys.rate_hz is not None:
             time, source = np.arange(content.height) / keys.rate_hz, self._at(table, "rate_hz")
         else:
@@ -230,12 +225,6 @@ class _Files:
                 facts: dict[str, float | str] = {"variant": "packets", "packet": clock.packet}
                 self.diagnostics.append(Diagnostic("time-stamps-uneven", INFO, path.name, facts=facts))
         return self._clocks[key]
-
-
-def _open(opened: dict[Path, T], read: Callable[[Path], T], path: Path) -> T:
-    if path not in opened:
-        opened[path] = read(path)
-    return opened[path]
 
 
 # Gaps --------------------------------------------------------------------------------------------------------------
@@ -276,10 +265,8 @@ def _bridge_gaps(measured: _Measured, faults: Sequence[Fault], gaps: bool) -> tu
 
 def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:
     """Put the values (n, k) of a signal on the clock, with a mask (n,) of the samples that exist."""
-    exists = clock.row >= 0
-    if exists.all() and len(rows) == len(clock.row):
-        values = rows
-    else:
+    exists, values = clock.row >= 0, rows
+    if not exists.all():
         values = np.full((len(clock.row), rows.shape[1]), np.nan)
         values[exists] = rows[clock.row[exists]]
     good = np.isfinite(values).all(axis=1)

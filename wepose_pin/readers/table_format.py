@@ -42,7 +42,7 @@ MOST_LINES = 200  # up to the names
 MOST_AFTER = 4  # lines of text between the names and the numbers
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "wxyz"}
 _COUNTS = {"gyro": (1, 3), "accel": (1, 3), "orientation": (1, 3, 4, 9)}  # of columns; 1 is a pattern
-_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?|\d{4}[/-]\d.*", re.IGNORECASE)
+_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?", re.IGNORECASE)
 _STATED_RATE = re.compile(r"\d+(\.\d*)?(?![\d.])")
 _Line = Annotated[float, Key(least=-MOST_AFTER, most=MOST_AFTER)]  # counted from the line of names; 0: there is none
 

@@ -1,6 +1,4 @@
-"""Biovision hierarchy (.bvh), without a library: the format is a page of text.
-
-The skeleton with the subject's lengths, and its motion.
+"""Biovision hierarchy (.bvh): the skeleton with the subject's lengths, and its motion.
 
 y is up, the person faces z with x on the left; centimetres and degrees. At zero the skeleton stands in the N-pose.
 Offsets are constant: by how much the shoulders move on the torso is lost.
@@ -28,18 +26,9 @@ from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 # Segment → joint, as other programs name them; those of other bodies have the segment's name in capitals.
-NAMES = {
-    "pelvis": "Hips",
-    "torso": "Spine",
-    "head": "Head",
-    **{
-        f"{side}_{segment}": f"{side.capitalize()}{name}"
-        for side in ("left", "right")
-        for segment, name in (
-            *(("upper_arm", "Arm"), ("forearm", "ForeArm"), ("hand", "Hand")),
-            *(("thigh", "UpLeg"), ("shank", "Leg"), ("foot", "Foot")),
-        )
-    },
+_LIMBS = {"upper_arm": "Arm", "forearm": "ForeArm", "hand": "Hand", "thigh": "UpLeg", "shank": "Leg", "foot": "Foot"}
+NAMES = {"pelvis": "Hips", "torso": "Spine", "head": "Head"} | {
+    f"{side}_{segment}": f"{side.capitalize()}{name}" for side in ("left", "right") for segment, name in _LIMBS.items()
 }
 ROOT = "Hips"  # whose orientation is that of the segment of this name, else of the reference segment
 SHORT_M, LONG_M = 0.2, 0.3  # [m] of a bone whose end is not known: of a segment without a length, and of others
@@ -85,11 +74,10 @@ def _build_skeleton(motion: Motion) -> Bone:
 
     def find_end(segment: str, at: np.ndarray, above_at: np.ndarray) -> np.ndarray:
         """Find where the bone of a segment ends (3,) [m]."""
-        own = [place for point, place in points.items() if next(reversed(model.reaches[point]), None) == segment]
-        if segment == table.reference and anchors:
-            own = [points[point] for point in anchors]
+        own = [point for point in points if next(reversed(model.reaches[point]), None) == segment]
+        own = list(anchors) if segment == table.reference and anchors else own
         if own:
-            return np.asarray(np.mean(own, axis=0))
+            return np.asarray(np.mean([points[point] for point in own], axis=0))
         if table.ends(segment) is not None:
             return at + LONG_M * np.array(table.segments[segment].along)
         return at + SHORT_M * (at - above_at) / max(float(np.linalg.norm(at - above_at)), 1e-9)
@@ -124,15 +112,10 @@ def _to_file_axes(v_W: np.ndarray) -> np.ndarray:
 
 
 def _compute_root_position(motion: Motion, root: Bone) -> np.ndarray:
-    """Compute where the hips are (n, 3) [m], so that the shoulders are where they were; a spine of many joints bends.
-
-    The shoulders without their motion on the torso, which does not lift the hips.
-    """
+    """Compute where the hips are (n, 3) [m], so that the shoulders, without their own motion, are where they were."""
     pose, model, anchors = motion.pose, motion.model, _find_anchors(motion)
-    if not anchors:
+    if not anchors or not set(anchors) <= set(pose.points):
         return np.zeros((len(pose.time), 3))
-    if lost := [point for point in anchors if point not in pose.points]:
-        raise BadData(f"{motion.where}: no columns {lost[0]}_x … in pose.parquet; a .bvh needs {' and '.join(anchors)}")
     R_WL = {segment: Rotation.from_quat(quat).as_matrix() for segment, quat in pose.quat_WL.items()}
     at_rest = []
     for point in anchors:

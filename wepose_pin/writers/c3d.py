@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from ..body.configuration import solve_configuration
 from ..body.links import compute_link_poses, find_known_links
-from ..errors import BadData, BadOption, how_to_install
+from ..errors import BadData
+from ..libraries import import_library
 from .motion import Motion, find_measured_points, resample_evenly
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
@@ -23,10 +24,7 @@ MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in sile
 
 def write_c3d(path: Path, motion: Motion) -> None:
     """Write points in W (z up, x forward) and segments to W, single precision; NaN in a gap, with a residual of −1."""
-    try:
-        import ezc3d
-    except ImportError:
-        raise BadOption(f"--format c3d: needs ezc3d: {how_to_install('ezc3d')}") from None
+    ezc3d = import_library("ezc3d", "--format c3d", "a C3D")
     motion = resample_evenly(motion)
     points = find_measured_points(motion)
     n = len(motion.pose.time)
@@ -51,8 +49,11 @@ def write_c3d(path: Path, motion: Motion) -> None:
         file.add_parameter("ROTATION", "LABELS", [f"{segment}_4X4" for segment in segments])
         file["data"]["rotations"] = np.stack(list(segments.values()), axis=-1).transpose(1, 2, 3, 0)
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
-    file.write(str(named))
-    named.replace(path)
+    try:
+        file.write(str(named))
+        named.replace(path)
+    finally:
+        named.unlink(missing_ok=True)
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:

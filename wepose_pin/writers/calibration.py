@@ -19,8 +19,7 @@ MOST_POINTS = 600  # of the residual over time
 def write_calibration(folder: Path, calibration: Calibration, provenance: Mapping[str, Any]) -> None:
     """Write the subject and ``calibration.json``, with the provenance, into an existing folder."""
     write_subject(folder, calibration.subject, calibration.subject.shape(calibration.problem.model))
-    content = as_json(_document(calibration)) | {"versions": versions()}
-    content["provenance"] = dict(provenance)
+    content = {**as_json(_document(calibration)), "versions": versions(), "provenance": dict(provenance)}
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
 
@@ -28,20 +27,13 @@ def write_calibration(folder: Path, calibration: Calibration, provenance: Mappin
 def _document(calibration: Calibration) -> dict[str, Any]:
     """The content of ``calibration.json``; lengths [m], times [s], angles as named, checks and diagnostics SI."""
     subject, quality = calibration.subject, calibration.quality
-    stride = -(-len(calibration.time) // MOST_POINTS)
-    some = slice(None, None, stride)
+    some = slice(None, None, -(-len(calibration.time) // MOST_POINTS))
     return {
         "quality": quality.quality,
         "diagnostics": [diagnostic_as_json(diagnostic) for diagnostic in quality.diagnostics],
         "checks": [
-            {
-                "code": check.diagnostic.code,
-                "place": check.diagnostic.place,
-                "quality": check.quality,
-                "value": _number(check.value),
-                "passes": check.limits.passes,
-                "poor": check.limits.poor,
-            }
+            {"code": check.diagnostic.code, "place": check.diagnostic.place, "quality": check.quality}
+            | {"value": _number(check.value), "passes": check.limits.passes, "poor": check.limits.poor}
             for check in quality.checks
         ],
         "protocol": calibration.problem.protocol.name,

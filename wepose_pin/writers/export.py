@@ -15,7 +15,6 @@ from ..angles import angle_table, diagnose_lock, joint_angles
 from ..arguments import check_arguments
 from ..body.kinematics import build_pose_table, find_samples
 from ..diagnostics import Diagnostic, notebook_html
-from ..documents import check_file as check_output
 from ..documents import whole_file
 from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file, find_plugins, load_plugin
@@ -71,34 +70,27 @@ def write_urdf(file: Path, result: Result) -> None:
         shutil.copyfile(urdf, file)
 
 
-def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Write every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
-    rows, diagnostics = build_table(motion)
-    with path.open("wb") as file:  # polars takes only a path in UTF-8
-        rows.fill_nan(None).write_csv(file)
-    return diagnostics
+def write_motion_table(path: Path, motion: Motion) -> list[Diagnostic]:
+    """Write the table of the pose, and beside it that of the angles where a joint has both of its segments.
 
-
-def write_parquet(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Write every number to its last bit; what is not known is NaN."""
-    rows, diagnostics = build_table(motion)
-    write_table(path, rows)
-    return diagnostics
-
-
-def build_table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
-    """Build the table of the pose, and beside it that of the angles where a joint has both of its segments."""
-    pose = build_pose_table(motion.pose).with_columns(**motion.pose.joints)
-    try:
+    Every number has all its bits. What is not known is empty in a CSV, NaN in Parquet.
+    """
+    rows, diagnostics = build_pose_table(motion.pose).with_columns(**motion.pose.joints), list[Diagnostic]()
+    with contextlib.suppress(BadData):  # no joint has both
         angles = joint_angles(motion.pose)
-    except BadData:
-        return pose, []
-    return pl.concat([pose, angle_table(angles).drop("time")], how="horizontal"), diagnose_lock(angles)
+        rows = pl.concat([rows, angle_table(angles).drop("time")], how="horizontal")
+        diagnostics = diagnose_lock(angles)
+    if not path.name.removesuffix(".partial").endswith(".csv"):
+        write_table(path, rows)
+    else:
+        with path.open("wb") as file:  # polars takes only a path in UTF-8
+            rows.fill_nan(None).write_csv(file)
+    return diagnostics
 
 
 # pyproject.toml registers them as those of other distributions.
-CSV = Format(PERSON, write_csv)
-PARQUET = Format(PERSON, write_parquet)
+CSV = Format(PERSON, write_motion_table)
+PARQUET = Format(PERSON, write_motion_table)
 MOT = Format(PERSON, write_mot, (*MOTION, "names"))
 STO = Format(PERSON, write_sto, (*MOTION, "osim_model"))
 PLACEMENT = Format(PERSON, write_placement, (), ".sto")
@@ -124,9 +116,6 @@ class Exported(NamedTuple):
 
     format: str  # one of `list_formats`
     diagnostics: list[Diagnostic]  # what of the result the format cannot hold
-
-    def __repr__(self) -> str:
-        return f"Exported({self.format!r}; {len(self.diagnostics)} diagnostics)"
 
     def _repr_html_(self) -> str:
         return notebook_html(self, self.diagnostics)
@@ -158,11 +147,9 @@ def export(
         The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
         One of `list_formats`, to which plug-ins add. Of a person: "csv", "parquet", "mot", "sto", "placement", "scale",
-        "trc", "c3d", "bvh". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix of
-        `file`; a stated format needs a file with its own suffix.
+        "trc", "c3d", "bvh". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix.
     names : "isb" or "opensim", optional
-        Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
-        None: both, the ISB's first.
+        Of a .mot: only the angles of the ISB, or only the coordinates of OpenSim's model; None: both.
     rate_hz : float, optional
         Resample the motion to so many samples a second first.
     interval, phase : optional
@@ -174,13 +161,12 @@ def export(
     instruction : str, optional
         Of "lerobot": what the robot does, in all episodes; None: "follow NAME".
     osim_model : str or Path, optional
-        Of "sto": the subject's OpenSim model, to which OpenSense's set-up files are written beside it. Of "scale": the
-        generic model that is scaled; None: "Rajagopal_2015.osim". Only its name is used.
+        Of "sto": the name of the subject's model, for which OpenSense's set-up files are written beside it. Of "scale":
+        that of the generic model; None: "Rajagopal_2015.osim".
     force : bool
         Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
-        What made the result (command, options, versions), written as JSON beside the file, or into it where it is a
-        folder.
+        What made the result (command, options, versions), written as JSON beside the file, or into the folder.
 
     Returns
     -------
@@ -204,10 +190,8 @@ def export(
     ['left_shoulder', 'right_shoulder']
     """
     check_arguments(export, locals())
-    results = [result] if isinstance(result, Result) else list(result)
-    file = Path(file)
-    name = _choose_format(file, format)
-    formats = list_formats()
+    results, file = [result] if isinstance(result, Result) else list(result), Path(file)
+    name, formats = _choose_format(file, format), list_formats()
     kind = formats[name]
     stated: dict[str, Any] = {"names": names, "rate_hz": rate_hz, "interval": interval, "phase": phase}
     stated |= {"episodes": episodes, "instruction": instruction, "osim_model": osim_model}
@@ -223,41 +207,31 @@ def export(
         raise BadOption(f"--format {name}: a file of {len(results)} results; only lerobot takes several, as episodes")
     own = {option: value for option, value in own.items() if option not in MOTION}
     with contextlib.ExitStack() as files:
-        if kind.earlier:
-            partial = files.enter_context(data_folder(file, force, kind.earlier))
-            if provenance is not None:
-                write_provenance(partial, provenance)
-        else:
-            check_output(file, force)
-            if provenance is not None:  # entered first, so that an error in writing the file names that one
-                beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
-            partial = files.enter_context(whole_file(file, force))
-            if provenance is not None:
-                write_provenance(beside.parent, provenance, beside.name)
-        if kind.of == BODY:
-            return Exported(name, kind.write(partial, results[0]) or [])
-        motions = [_read_motion(each, name, interval, phase, rate_hz) for each in results]
-        if kind.of == ROBOTS:
-            return Exported(name, kind.write(partial, motions, **own) or [])
+        whole = data_folder(file, force, kind.earlier) if kind.earlier else whole_file(file, force)
+        partial = files.enter_context(whole)
+        motions = [] if kind.of == BODY else [_read_motion(each, name, interval, phase, rate_hz) for each in results]
         if name == "sto" and own:
             setups = [files.enter_context(whole_file(path, force)) for path in list_setups(file)]
             write_setups(file, setups, motions[0], str(own.pop("osim_model")))
-        return Exported(name, kind.write(partial, motions[0], **own) or [])
+        source = results[0] if kind.of == BODY else motions if kind.of == ROBOTS else motions[0]
+        written = Exported(name, kind.write(partial, source, **own) or [])
+        if provenance is not None and kind.earlier:
+            write_provenance(partial, provenance)
+        elif provenance is not None:
+            write_provenance(file.parent, provenance, f"{file.name}.provenance.json")
+    return written
 
 
 def _is_of_robot(result: Result) -> bool:
     if isinstance(result, str | Path):
         return (Path(result) / TRAJECTORY).is_file()
-    return not isinstance(result, TrackResult)
+    return isinstance(result, HasJointMotion)
 
 
 def _read_motion(
     result: Result, format: str, interval: tuple[float, float] | None, phase: str | None, rate_hz: float | None
 ) -> Any:
-    """Read the selected part of a motion, two samples at least: a `Motion` for formats of a person, or `JointMotion`.
-
-    It is resampled where a rate is given.
-    """
+    """Read the selected part of a motion, resampled: a `Motion` for formats of a person, or `JointMotion`."""
     of = list_formats()[format].of
     if _is_of_robot(result):
         if of == PERSON:
@@ -291,8 +265,6 @@ def _choose_format(file: Path, name: str | None) -> str:
     if name not in formats:
         raise BadOption(f"--format {name}: not known; {one_of(formats, name)}")
     needed = f".{name}" if formats[name].suffix is None else formats[name].suffix
-    if not needed and suffix.removeprefix(".") in (*formats, "bag", "db3"):  # readers would take it for a file
-        raise BadOption(f"-o {file}: format {name} is a folder; name it {file.stem}")
     if needed and suffix != needed:
         raise BadOption(f"-o {file}: format {name} is for programs that go by the suffix: name it {file.stem}{needed}")
     return name

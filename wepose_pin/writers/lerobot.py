@@ -17,7 +17,8 @@ import numpy as np
 import polars as pl
 
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, BadOption, WrongOption, how_to_install, one_of
+from ..errors import BadData, WrongOption, one_of
+from ..libraries import import_library
 from .motion import REPETITIONS, JointMotion, is_even
 from .result import write_table
 
@@ -34,10 +35,8 @@ def write_lerobot(
 ) -> list[Diagnostic]:
     """Write a data set into an existing folder.
 
-    Parameters
-    ----------
-    episodes : "repetitions": each repetition of a movement is one; a phase: each of its intervals; None: each motion
-    instruction : the task of all episodes; None: "follow NAME", and the name of the phase
+    `episodes`: "repetitions" of the movement, or the intervals of a phase; None: the motions. `instruction`: the task
+    of all; None: "follow NAME", and the name of the phase.
     """
     rate_hz = _check_alike(motions)
     listed, diagnostics = list[Episode](), list[Diagnostic]()
@@ -46,16 +45,15 @@ def write_lerobot(
     tasks = list(dict.fromkeys(task for _, _, task in listed))
     tables, begins = [], np.cumsum([0, *(len(part.time) for part, _, _ in listed)])
     for k, (part, after, task) in enumerate(listed):
-        state = part.position
-        n = len(state)
+        frames = np.arange(len(part.time))
         columns = {
-            STATE: _to_lists(state),
-            ACTION: _to_lists(np.vstack([state[1:], after])),
-            "timestamp": (np.arange(n) / rate_hz).astype(np.float32),
-            "frame_index": np.arange(n),
-            "episode_index": np.full(n, k),
-            "index": begins[k] + np.arange(n),
-            "task_index": np.full(n, tasks.index(task)),
+            STATE: _to_lists(part.position),
+            ACTION: _to_lists(np.vstack([part.position[1:], after])),
+            "timestamp": (frames / rate_hz).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(len(frames), k),
+            "index": begins[k] + frames,
+            "task_index": np.full(len(frames), tasks.index(task)),
         }
         tables.append(pl.DataFrame(columns))
     for name in ("data", "meta/episodes"):
@@ -98,12 +96,11 @@ def _list_episodes(
         text += f", {by}"
     parts = [part for span in spans if (part := motion.samples(span)).stop - part.start >= 2]
     if not parts:
-        reason = "the trajectory follows none of it" if spans else "it has no such phase"
+        why = "the trajectory follows none of it" if spans else "it has no such phase"
         if by == REPETITIONS and not spans:
-            reason = ": ".join(filter(None, ("no repetitions were found in it", motion.no_repetitions)))
+            why = f"no repetitions were found in it: {motion.no_repetitions}"
         known = [name for name, intervals in motion.phases.items() if intervals and name != by]
-        choices = one_of(known, by) if known else "leave --episodes out"
-        raise WrongOption("episodes", by, f"{motion.where}: {reason}; {choices}")
+        raise WrongOption("episodes", by, f"{motion.where}: {why}; {one_of(known, by)}")
     if len(parts) < len(spans):
         first, last = motion.recorded_time[[motion.begin, -1]]
         facts: dict[str, float | str] = {"count": float(len(spans)), "recorded": f"{first:g} to {last:g} s"}
@@ -143,18 +140,10 @@ def _compute_stats(table: pl.DataFrame) -> dict[str, dict[str, list[Any]]]:
 
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """Write the tasks as pandas writes a table whose index is their text; pyarrow stores what pandas says of it.
-
-    Raises
-    ------
-    BadOption
-        pyarrow is not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise BadOption(f"--format lerobot: needs pyarrow: {how_to_install('pyarrow')}") from None
+    """Write the tasks as pandas writes a table whose index is their text; pyarrow stores what pandas says of it."""
+    pyarrow, parquet = (
+        import_library(name, "--format lerobot", "a data set") for name in ("pyarrow", "pyarrow.parquet")
+    )
     index = "__index_level_0__"
     kinds = {"task_index": ("task_index", "int64", "int64"), index: (None, "unicode", "object")}
     columns = [
@@ -163,4 +152,4 @@ def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     ]
     pandas = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pyarrow.table({"task_index": list(range(len(tasks))), index: list(tasks)})
-    pyarrow.parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)
+    parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -90,14 +90,14 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
         return (1.0 - w) * cov[after - 1] + w * cov[after]
 
     quat_WL = {name: Slerp(old, Rotation.from_quat(quat))(time).as_quat() for name, quat in pose.quat_WL.items()}
+    gaps = {
+        name: (gap[after - 1] & (share < 1.0 - 1e-6)) | (gap[after] & (share > 1e-6)) for name, gap in pose.gap.items()
+    }
     new = replace(
         compute_pose(motion.model, time, quat_WL),
         segment_cov={name: between(cov) for name, cov in pose.segment_cov.items()},
         point_cov={name: between(cov) for name, cov in pose.point_cov.items()},
-        gap={
-            name: (gap[after - 1] & (share < 1.0 - 1e-6)) | (gap[after] & (share > 1e-6))
-            for name, gap in pose.gap.items()
-        },
+        gap=gaps,
     )
     return replace(motion, pose=new)
 
@@ -163,19 +163,21 @@ class JointMotion:
         return find_usual_rate(self.time)
 
     @cached_property
-    def ordered(self) -> tuple[Any, ...]:
-        """The URDF's joints depth first, in the order of the file, as MuJoCo numbers them."""
-        below = parse_tree(self.robot, self.where).below
-        order, open_joints = list[Any](), list(reversed(below[self.root]))
-        while open_joints:
-            order.append(open_joints.pop())
-            open_joints += reversed(below[order[-1].child])
-        return tuple(order)
-
-    @cached_property
     def root(self) -> str:
         """The link without a parent."""
         return str(parse_tree(self.robot, self.where).root)
+
+    @cached_property
+    def ordered(self) -> tuple[Any, ...]:
+        """The URDF's joints depth first, in the order of the file, as MuJoCo numbers them."""
+        below = parse_tree(self.robot, self.where).below
+
+        def walk(link: str) -> Iterator[Any]:
+            for joint in below[link]:
+                yield joint
+                yield from walk(joint.child)
+
+        return tuple(walk(self.root))
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -190,8 +192,9 @@ class JointMotion:
 
     def rates(self, joint: str) -> np.ndarray:
         """Return the velocities (n,) of a joint [rad/s or m/s]."""
-        moves = joint in self.joints
-        return np.asarray(self.velocity[:, self.joints.index(joint)]) if moves else np.zeros(len(self.time))
+        if joint in self.joints:
+            return np.asarray(self.velocity[:, self.joints.index(joint)])
+        return np.zeros(len(self.time))
 
     def samples(self, interval: tuple[float, float]) -> slice:
         """Return the samples after the approach that follow an interval [s] of the recording."""
@@ -209,10 +212,8 @@ class JointMotion:
         """Return the part that follows an interval [s] or a phase of the recording; both None: all of it."""
         phases = {name: spans for name, spans in self.phases.items() if name != REPETITIONS}
         selected = select_interval(self.recorded_time, phases, interval, phase)
-        if selected is None:
-            return self
-        part = self.cut(self.samples(selected))
-        if len(part.time) < 2:
+        part = self if selected is None else self.cut(self.samples(selected))
+        if selected is not None and len(part.time) < 2:
             raise BadData(f"{self.where}: follows no {selected[0]:g} to {selected[1]:g} s of the recording")
         return part
 
@@ -274,9 +275,8 @@ def compute_link_poses_W(motion: JointMotion) -> dict[str, tuple[np.ndarray, np.
 def read_joint_motion(folder: Path) -> JointMotion:
     """Read the trajectory that `wepose retarget` wrote; `MissingFile` or `BadData`: it is none, or is damaged."""
     file, summary_file, urdf = folder / TRAJECTORY, folder / "summary.json", folder / ROBOT_URDF
-    for path in (file, summary_file, urdf):
-        if not path.is_file():
-            raise MissingFile(f"{folder}: no {path.name} in it; a folder that `wepose retarget` wrote is wanted here")
+    if lost := [path.name for path in (file, summary_file, urdf) if not path.is_file()]:
+        raise MissingFile(f"{folder}: no {lost[0]} in it; a folder that `wepose retarget` wrote is wanted here")
     with library_errors(summary_file, "the summary of a trajectory"):
         summary = json.loads(summary_file.read_text(encoding="utf-8"))
         joints = tuple(map(str, summary["joints"]))

@@ -56,12 +56,8 @@ _CLOSE = 1e-9  # [rad] of the last step
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
     """Write joint angles in degrees: the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
-    Beside the three angles of a joint ``<joint>_near_lock`` is 1 where the first and the third are not to be read. Of a
-    mechanism it has the joints of its URDF by their names, in degrees, and in m those that slide.
-
-    Parameters
-    ----------
-    names : only these: "isb" or "opensim"
+    ``<joint>_near_lock`` is 1 where the first and the third angle of a joint are not to be read. A mechanism has the
+    joints of its URDF, in degrees or m. `names`: only "isb" or "opensim".
     """
     check_complete(motion, "a .mot")
     diagnostics, angles, others = diagnose_gaps(motion), dict[str, np.ndarray](), dict[str, np.ndarray]()
@@ -100,24 +96,19 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
 def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
     """Write orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``."""
     check_complete(motion, "a .sto")
-    _write_quaternions(path, motion, motion.pose.time, _find_bodies(motion))
+    _write_quaternions(path, motion, motion.pose.time, orientations(motion.pose.quat_WL))
     return diagnose_gaps(motion)
 
 
 def write_placement(path: Path, motion: Motion) -> None:
     """Write one sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
     upright = np.array([[0.0, 0.0, 0.0, 1.0]])
-    _write_quaternions(path, motion, np.zeros(1), dict.fromkeys(_find_bodies(motion), upright))
-
-
-def _find_bodies(motion: Motion) -> dict[str, np.ndarray]:
-    bodies = orientations(motion.pose.quat_WL)
-    if not bodies:
-        raise BadData(f"{motion.where}: no segment in pose.parquet is a body of the model; there is none to write")
-    return bodies
+    _write_quaternions(path, motion, np.zeros(1), dict.fromkeys(orientations(motion.pose.quat_WL), upright))
 
 
 def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Mapping[str, np.ndarray]) -> None:
+    if not quat_GB:
+        raise BadData(f"{motion.where}: no segment in pose.parquet is a body of the model; there is none to write")
     cells = {
         f"{body}_imu": [f"{w:.9f},{x:.9f},{y:.9f},{z:.9f}" for x, y, z, w in quat.tolist()]
         for body, quat in quat_GB.items()
@@ -132,10 +123,7 @@ def list_setups(sto: Path) -> list[Path]:
 
 
 def write_setups(sto: Path, written: Sequence[Path], motion: Motion, model: str) -> None:
-    """Write what OpenSense needs beside the .sto of a motion, to `written` in the order of `list_setups`.
-
-    `model` is the name of the subject's model.
-    """
+    """Write what OpenSense needs beside a .sto to `written`, in the order of `list_setups`; `model`: the subject's."""
     write_placement(written[0], motion)
     written[1].write_bytes(_fill("placer", model=model, stem=sto.stem))
     step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
@@ -153,22 +141,15 @@ def _fill(setup: str, *, scales: str = "", **values: str) -> bytes:
 
 
 def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MODEL) -> None:
-    """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths.
+    """Write the set-up of OpenSim's Scale Tool that gives a generic model the subject's lengths; masses stay.
 
-    The factors are over the lengths of Rajagopal's model. Masses stay. No markers are placed, so the tool's part for
-    them is left out.
-
-    Parameters
-    ----------
-    osim_model : name of the generic model
+    The factors are over the lengths of Rajagopal's model.
     """
     factors: dict[str, dict[str, float]] = {}
     for length, place in LENGTHS.items():
-        if length in motion.model.lengths:
-            factor = motion.model.lengths[length] / place["generic"]
-            for body in place["bodies"]:
-                scaled = dict.fromkeys(place.get("axes", "xyz"), factor)
-                factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(scaled)
+        for body in place["bodies"] if length in motion.model.lengths else ():
+            scaled = dict.fromkeys(place.get("axes", "xyz"), motion.model.lengths[length] / place["generic"])
+            factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(scaled)
     if not factors:
         raise BadData(f"{motion.where}: the body has no length that OpenSim's model of a person has")
     scales = "".join(
@@ -218,14 +199,6 @@ def _write_rows(path: Path, header: Sequence[str], rows: pl.DataFrame, labels: b
 # Rajagopal's model ---------------------------------------------------------------------------------------------------
 
 
-def _compute_n_pose(body: str) -> Rotation:
-    """Compute a body's rotation to G in the N-pose, palms to the thighs: 90° of `pro_sup`."""
-    if not body.startswith(("radius", "hand")):
-        return Rotation.identity()
-    mirror = np.array([-1.0, -1.0, 1.0]) if body.endswith("_l") else 1.0
-    return Rotation.from_rotvec(np.pi / 2.0 * mirror * _PRONATION / np.linalg.norm(_PRONATION))
-
-
 def in_ground(p_W: np.ndarray) -> np.ndarray:
     """Return vectors (n, 3) of W in G."""
     return np.column_stack([p_W[:, 0], p_W[:, 2], -p_W[:, 1]])
@@ -236,12 +209,13 @@ def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     The N-pose, palms to the thighs, is the model with 90° of `pro_sup` and zero of all others.
     """
-    quat_GW = _R_GW.as_quat()
+    quat_GW, pronated = _R_GW.as_quat(), _PRONATION / np.linalg.norm(_PRONATION) * np.pi / 2.0
     bodies = {}
     for segment, body in BODIES.items():
         if segment in quat_WL:
             moved = multiply(multiply(quat_GW, quat_WL[segment]), conjugate(quat_GW))
-            bodies[body] = multiply(moved, _compute_n_pose(body).as_quat())
+            n_pose = pronated * float(body.startswith(("radius", "hand"))) * ([-1, -1, 1] if body.endswith("_l") else 1)
+            bodies[body] = multiply(moved, Rotation.from_rotvec(n_pose).as_quat())
     return bodies
 
 
@@ -283,9 +257,9 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
 
 
 def _fit_arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
-    """Fit the humerus (n, 4), the angles of elbow and wrist, and how far each body is off, all (n,) [rad].
+    """Fit the humerus (n, 4) and the angles of elbow and wrist to `quat` (n, 4) of humerus, radius and perhaps hand.
 
-    `quat`: orientations (n, 4) of humerus, radius and, where it is measured, hand.
+    And how far each body is off; angles are (n,) [rad].
     """
     axes = [np.array(axis) / np.linalg.norm(axis) for axis in _AXES[: 2 * len(quat) - 2]]
     starts: list[np.ndarray] = []
@@ -312,8 +286,8 @@ def _body_errors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the rotation vectors (n, 3 m) from the m measured bodies to the model's, and their Jacobian.
 
-    The Jacobian (n, 3 m, 3 + k) is by a turn of the humerus on its right and by the k angles. The change of a rotation
-    vector is taken as that of the turn: the gradient of its square is exact so.
+    It (n, 3 m, 3 + k) is by a turn of the humerus on its right and by the k angles; of a rotation vector that of the
+    turn, which makes the gradient of its square exact.
     """
     n = len(humerus)
     error, J = np.empty((n, 3 * len(quat))), np.zeros((n, 3 * len(quat), 3 + angles.shape[1]))

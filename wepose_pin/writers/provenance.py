@@ -1,10 +1,8 @@
-"""The provenance of a result: the job that made it as data, hashes of its inputs, code, packages and machine.
-
-And the folder that is written into, which may hold an earlier result, or the inputs.
-"""
+"""The provenance of a result, with hashes of inputs and code; and folders that may hold an earlier result or inputs."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import platform
@@ -35,12 +33,11 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 @lru_cache(maxsize=1)
 def code() -> dict[str, str | None]:
     """Return version, commit where it is known (`+`: files were changed since), and the hash of code and data."""
-    digest = hashlib.sha256()
+    digest, commit = hashlib.sha256(), ""
     for folder in (_PACKAGE, asset("urdf", "upper_body.urdf").parent, asset("calibration", "clasp.toml").parent):
         files = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix in (".py", ".toml", ".urdf"))
         for file in sorted(file for file in files if file.parts[0] != "_assets"):  # a wheel has the data in the package
             digest.update(file.as_posix().encode() + b"\0" + (folder / file).read_bytes() + b"\0")
-    commit = ""
     if (_PACKAGE.parent / ".git").exists() and shutil.which("git"):  # no wheel
         words = ["git", "-C", str(_PACKAGE.parent), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
         commit = subprocess.run(words, capture_output=True, text=True).stdout.strip()
@@ -48,11 +45,7 @@ def code() -> dict[str, str | None]:
 
 
 def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Collect the provenance of what a command makes.
-
-    `command` is as on the command line, or `CALL`; `values` are its options: those that name existing files are inputs.
-    `MissingFile` is raised where one cannot be read.
-    """
+    """Collect the provenance of what a command, or `CALL`, makes; of its options those that name files are inputs."""
     inputs: dict[str, Path] = {}
     options = {name: value for name, value in values.items() if name not in ("out", "force")}
     for name, value in list(options.items()):
@@ -87,11 +80,7 @@ def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
 
 
 def list_files(path: Path, truth: bool = False) -> list[Path]:
-    """List the files that an input consists of, each followed by those that it needs.
-
-    Of a session or a model's table the files that it names too; of a URDF the tables beside it that are read with it;
-    of a result what others are made from.
-    """
+    """List the files that an input consists of, each followed by those that it needs: that it names or is read with."""
     if (path / "session.toml").is_file():
         path = path / "session.toml"
     if path.is_dir():
@@ -116,11 +105,9 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     """List the files and folders that a session, or a model's table, names, as they stand there."""
     if path.suffix != ".toml" or not path.is_file():  # a pipe would block
         return []
-    try:
+    names, content = set(), dict[str, Any]()
+    with contextlib.suppress(OSError, ValueError):  # its reader reports what is wrong
         content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except (OSError, ValueError):
-        return []  # its reader reports what is wrong
-    names = set()
 
     def visit(table: Mapping[str, Any]) -> None:
         for key, value in table.items():
@@ -161,11 +148,7 @@ def data_folder(out: Path, force: bool, earlier: Sequence[str]) -> Iterator[Path
 def result_folder(out: Path, force: bool) -> Iterator[Path]:
     """`data_folder` of a result; of an earlier result in `out` those files go that would be read with the new one.
 
-    Raises
-    ------
-    ExistingOutput
-        As `whole_folder`; a session in `out` needs a file that would be replaced; a file of the user's would be read
-        with the result.
+    `ExistingOutput` is raised where a file of the user's would be read with the result, or an input be replaced.
     """
     inputs = {file.resolve() for file in list_files(out, truth=True)} if (out / "session.toml").is_file() else set()
     stale = [name for name in (MODEL_TABLE, JOINTS) if (out / name).exists()]

@@ -40,16 +40,10 @@ SUBJECT_URDF = "subject.urdf"
 ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
 
 
-def write_result(
-    folder: Path,
-    tracked: TrackResult,
-    summary: TrackSummary,
-    torques: Torques | None = None,
-    provenance: Mapping[str, Any] | None = None,
-) -> None:
-    """Write a recording that was tracked as a whole into an existing folder."""
+def write_result(folder: Path, tracked: TrackResult, summary: TrackSummary, **others: Any) -> None:
+    """Write a recording that was tracked as a whole into an existing folder; `others` as of `write_about`."""
     write_poses(folder, [tracked])
-    write_about(folder, tracked, summary, torques, provenance)
+    write_about(folder, tracked, summary, **others)
 
 
 def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = False) -> None:
@@ -86,18 +80,14 @@ def write_about(
     torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the files of a result beside its poses.
-
-    `tracked` is the last chunk; the phases of its recording go to the summary, and pages made from the folder show
-    them. `torques` become ``torques.parquet``, `provenance` becomes part of the summary.
-    """
-    content = summary.content
+    """Write the files of a result beside its poses; `tracked` is the last chunk."""
+    write_subject(folder, tracked.subject, tracked.model)
+    about = dict(summary.content)
     if torques is not None:
         write_table(folder / "torques.parquet", torque_table(torques))
-        content = {**content, "torques": torques.summary()}
-    write_subject(folder, tracked.subject, tracked.model)
+        about["torques"] = torques.summary()
     spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in tracked.phases.items()}
-    about = {**content, "recorded_phases": spans, "versions": versions()}
+    about |= {"recorded_phases": spans, "versions": versions()}
     if tracked.marks:
         about["recorded_marks"] = [[mark.time, mark.text] for mark in tracked.marks]
     if provenance is not None:
@@ -148,9 +138,9 @@ def read_result(
         table, place = read_table(folder / JOINTS), str(folder / JOINTS)
         joints = {name: read_columns(table, [name], place, place)[:, 0] for name in table.columns if name != "time"}
         pose = replace(pose, joints=joints)
-    summary_file = folder / "summary.json"
-    with library_errors(summary_file, "the summary of a result"):
-        summary = dict(json.loads(summary_file.read_text(encoding="utf-8"))) if summary_file.is_file() else {}
+    file, summary = folder / "summary.json", dict[str, Any]()
+    with library_errors(file, "the summary of a result"):
+        summary |= json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     model, subject_file = load_model(folder / SUBJECT_URDF), folder / "subject.toml"
     if model.table.girdles and subject_file.is_file():
         model = replace(model, girdles=load_subject(subject_file).girdles)
@@ -211,12 +201,8 @@ def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
 @cache
 def versions() -> dict[str, str]:
     """Package → version, for the provenance of a result."""
-    packages = ("pin", "casadi", "numpy", "scipy", "numba", "polars")
-    return {
-        "wepose-pin": __version__,
-        "python": platform.python_version(),
-        **{name: version(name) for name in packages},
-    }
+    packages = {name: version(name) for name in ("pin", "casadi", "numpy", "scipy", "numba", "polars")}
+    return {"wepose-pin": __version__, "python": platform.python_version(), **packages}
 
 
 def as_json(value: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadOption, how_to_install
+from ..libraries import import_library
 from .motion import JointMotion, LinkTransform, compute_link_transforms
 
 FIXED_FRAME = "map"
@@ -46,26 +46,21 @@ def write_mcap(path: Path, motion: JointMotion) -> None:
 
 
 def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
-    try:
-        from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise BadOption(f"--format rosbag, mcap: needs rosbags: {how_to_install('rosbags')}") from None
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    never = QosTime(0, 0)
-    latched = Qos(
-        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
-        QosLiveliness.AUTOMATIC, never, False,
-    )  # fmt: skip
+    qos = import_library("rosbags.interfaces", "--format rosbag, mcap", "a ROS bag")
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, never = get_typestore(Stores.ROS2_HUMBLE), qos.QosTime(0, 0)
+    reliable, transient = qos.QosReliability.RELIABLE, qos.QosDurability.TRANSIENT_LOCAL
+    automatic = qos.QosLiveliness.AUTOMATIC
+    latched = qos.Qos(qos.QosHistory.KEEP_LAST, 1, reliable, transient, never, never, automatic, never, False)
     bag = Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin[storage])
     if storage == "MCAP":  # of a bag with SQLite only whole files or messages could be, which not every reader takes
         bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with bag as writer:
+        profiles = {topic: [latched] if topic in LATCHED else [] for topic in TYPES}
         connections = {
-            topic: writer.add_connection(
-                topic, kind, typestore=store, offered_qos_profiles=[latched] if topic in LATCHED else []
-            )
+            topic: writer.add_connection(topic, kind, typestore=store, offered_qos_profiles=profiles[topic])
             for topic, kind in TYPES.items()
         }
         for topic, time_ns, message in _list_messages(motion, store.types):
@@ -85,13 +80,8 @@ def _list_messages(motion: JointMotion, types: Any) -> Iterator[tuple[str, int, 
     joints = list(motion.moving)
     position, velocity = (np.stack([get(joint) for joint in joints], axis=1) for get in (motion.values, motion.rates))
     for k, stamp in enumerate(stamps):
-        state = types["sensor_msgs/msg/JointState"](
-            header=_make_header(types, stamp, ""),
-            name=joints,
-            position=position[k],
-            velocity=velocity[k],
-            effort=np.empty(0),
-        )
+        header = _make_header(types, stamp, "")
+        state = types["sensor_msgs/msg/JointState"](header, joints, position[k], velocity[k], np.empty(0))
         yield "/joint_states", stamp, state
         if moving:
             yield "/tf", stamp, _make_transforms(types, stamp, moving, k)

@@ -35,9 +35,8 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     for link, (quat, p) in compute_link_poses_W(motion).items():
         entity = f"body/{rr.escape_entity_path_part(link)}"
         if np.ptp(p, axis=0).any() or np.ptp(quat, axis=0).any():
-            recording.send_columns(
-                entity, indexes=index, columns=rr.Transform3D.columns(translation=p, quaternion=quat)
-            )
+            columns = rr.Transform3D.columns(translation=p, quaternion=quat)
+            recording.send_columns(entity, indexes=index, columns=columns)
         else:
             place = rr.Transform3D(translation=p[0], quaternion=rr.Quaternion(xyzw=quat[0]))
             recording.log(entity, place, static=True)
@@ -56,13 +55,11 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
 
 def _load_meshes(motion: JointMotion) -> list[tuple[str, Mesh, np.ndarray]]:
     """Link, mesh in its frame and colour; empty where a file of a mesh is not found."""
-    folders = package_folders(Path(motion.where) / ROBOT_URDF)
+    folders, kind = package_folders(Path(motion.where) / ROBOT_URDF), pin.GeometryType.VISUAL
     try:
         with native_stderr_muted():
             model = pin.buildModelFromXML(motion.urdf)
-            shapes = pin.buildGeomFromUrdfString(
-                model, motion.urdf, pin.GeometryType.VISUAL, package_dirs=folders
-            ).geometryObjects
+            shapes = pin.buildGeomFromUrdfString(model, motion.urdf, kind, package_dirs=folders).geometryObjects
     except (ValueError, RuntimeError):
         return []
     links, meshes = [], []
