@@ -163,7 +163,7 @@ def _read_person(keys: TomlTable, *others: str) -> dict[str, Any]:
     keys.allow(*PERSON, *others)
     body = load_table()
     keys.table("measured", {}).allow(*body.lengths, *list_breadths(body))
-    person = {name: keys.values[name] for name in PERSON if keys.values.get(name)}
+    person = {name: keys.values[name] for name in PERSON if keys.values.get(name) not in (None, "", {})}
     if person:
         _check_options(keys, "calibrate", person)
     return person
