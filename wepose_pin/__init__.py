@@ -21,7 +21,9 @@ Conventions, everywhere:
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what editors and type checkers see
@@ -72,33 +74,11 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .writers.export import export as export
     from .writers.result import load_result as load_result
 
-# Loaded on first use, so that the command line answers at once.
-_ROOMS = {
-    "angles": "Angles joint_angles",
-    "body": "BodyModel load_model",
-    "body.kinematics": "Pose",
-    "body.subject": "Subject load_subject population_subject",
-    "calibration": "Calibration calibrate",
-    "diagnostics": "Diagnostic",
-    "errors": (
-        "BadData BadModel BadOption BadPhase BadSession BadSource BadSubject ExistingOutput MissingFile "
-        "NoSolution WeposeError WeposeWarning"
-    ),
-    "evaluation": "evaluate",
-    "filters": "estimate_orientation",
-    "filters.static": "StaticTest",
-    "readers": "load_session",
-    "recording": "ImuSensor OrientationSensor Recording",
-    "retargeting": "retarget",
-    "simulation": (
-        "IDEAL_PRESET Imperfections ImuNoise MILD_PRESET NOISE_FREE PEOPLE_PRESET Person Simulation "
-        "simulate simulate_activity simulate_person"
-    ),
-    "tracking": "TrackResult track",
-    "writers.export": "export",
-    "writers.result": "load_result",
+# Name → room, of the lines above: loaded on first use, so that the command line answers at once.
+_WHERE = {
+    name: room
+    for room, name in re.findall(r"from \.([\w.]+) import (\w+) as", Path(__file__).read_text(encoding="utf-8"))
 }
-_WHERE = {name: room for room, names in _ROOMS.items() for name in names.split()}
 # What the methods of `TrackResult` call in rooms above its own.
 _OF_RESULTS = {"draw_figures": "report.track", "show_result": "report.pages", "save_result": "report.pages"}
 __all__ = ["__version__", *sorted(_WHERE)]

@@ -27,10 +27,7 @@ R = TypeVar("R")
 
 
 def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> dict[str, Any]:
-    """Read a TOML file; `what` names the expected contents in an error's text.
-
-    Raise `MissingFile` where the file is missing or cannot be read, an `error` where it is not TOML.
-    """
+    """Read a TOML file, which holds `what`; raise `MissingFile`, or where it is not TOML an `error`."""
     if not path.is_file():
         state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
         raise MissingFile(f"{path}: {state}; {what} is wanted here")

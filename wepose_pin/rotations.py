@@ -106,10 +106,7 @@ def heading(quat_WV: ArrayLike) -> np.ndarray:
 
 
 def unwrap_signs(quat: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
-    """The same rotations (n, 4) with signs chosen such that neighbours lie on one side (for files and plots).
-
-    The first keeps its sign, or takes that of `before` (4,).
-    """
+    """The same rotations (n, 4) with signs by which neighbours lie on one side, and the first with `before` (4,)."""
     jumps = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))
     first = 1.0 if before is None else np.sign(quat[0] @ before)
     signs = np.concatenate([[first], jumps])

@@ -53,10 +53,7 @@ def compute_population_lengths(
 
 
 def list_breadths(table: BodyTable) -> dict[str, tuple[str, float, float]]:
-    """Breadth → the length between joint centres that it gives, its ratio to the breadth, and the ratio's std.
-
-    Sources stand in ``calibration/anthropometry.toml``.
-    """
+    """Breadth → the length between joint centres that it gives, its ratio to the breadth, and the ratio's std."""
     of_share = {length.share: name for name, length in table.lengths.items()}
     return {
         name: (of_share[entry["share"]], entry["ratio"], entry["std"])
@@ -68,10 +65,7 @@ def list_breadths(table: BodyTable) -> dict[str, tuple[str, float, float]]:
 def convert_breadths(
     measured: Mapping[str, float], table: BodyTable, measured_std: float
 ) -> dict[str, tuple[float, float]]:
-    """Measured lengths and distances with one standard deviation each [m], those given as a breadth converted.
-
-    Raise `BadOption` where a breadth and the length that it gives are both measured.
-    """
+    """Convert measured breadths to lengths, each [m] with its standard deviation; `BadOption`: both are measured."""
     breadths, converted = list_breadths(table), {}
     for name, metres in measured.items():
         length, ratio, std = breadths.get(name, (name, 1.0, 0.0))

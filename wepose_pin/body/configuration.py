@@ -114,10 +114,7 @@ def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
 
 
 class _ExactChain:
-    """The joints from the measured segment A above, or W, to a segment L; the spherical one nearest to L is free.
-
-    Joints with limits keep them, and joints behind the free one rest.
-    """
+    """The joints from the measured segment A above, or W, to a segment L; those behind its spherical joint rest."""
 
     def __init__(self, model: BodyModel, segment: str, segments: Sequence[str], limits: bool) -> None:
         m, chain, data = model.pin, model.chains[segment], model.pin.createData()

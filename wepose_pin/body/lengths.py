@@ -30,10 +30,7 @@ def measure_lengths(robot: Any, table: BodyTable) -> dict[str, float]:
 
 
 def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> Any:
-    """A copy of the robot with these lengths [m], each of which it has.
-
-    A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
-    """
+    """Return a copy of the robot with these lengths [m]: segments stretch along their lines, all joints at zero."""
     robot = pickle.loads(pickle.dumps(robot, pickle.HIGHEST_PROTOCOL))  # several times as fast as `copy.deepcopy`
     tree, own = parse_tree(robot, robot.name), measure_lengths(robot, table)
     of_links, of_joints = _find_stretches(tree, table)

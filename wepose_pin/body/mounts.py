@@ -48,10 +48,7 @@ class StartPose:
     q: np.ndarray | None = None  # (nq,) the body's configuration; None: not known
 
     def std(self, segment: str, *, again: bool = False) -> np.ndarray:
-        """Return one standard deviation (3,) [rad] about each axis of a segment's rotation off the start pose.
-
-        `again` : between two start poses of one person
-        """
+        """Return one std (3,) [rad] of a segment's rotation off the start pose, or, `again`, between two of them."""
         own = self.table.segments[segment]
         return np.array(own.repeat_std if again else own.start_std)
 

@@ -31,10 +31,7 @@ class TissueMean(NamedTuple):
 
 
 def estimate_scatter(hinge_stds: Collection[float]) -> float:
-    """Estimate `TissueMean.scatter` by empirical Bayes.
-
-    `hinge_stds` [rad] are the angles by which a person's segments leave the planes of their hinges.
-    """
+    """Estimate `TissueMean.scatter` of the angles [rad] by which segments leave their hinges, by empirical Bayes."""
     if not hinge_stds:
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + HINGE_LOG_STD**2)

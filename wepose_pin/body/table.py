@@ -210,10 +210,7 @@ class BodyTable:
         return next((name for name, each in self.lengths.items() if {*each.start, *each.end} == set(points)), None)
 
     def find_limb(self, point: str) -> Limb | None:
-        """Return the limb up to a point; None where the point is on none, or is the first one of its limb.
-
-        A line between a point and its counterpart, as between the shoulders, is no limb.
-        """
+        """Return the limb up to a point; None: it is on none, or its first one. A line across the body is no limb."""
         lines = (line for line in self.draw.limbs if point in line[1:] and self.counterpart(line[0]) not in line)
         line = next(lines, None)
         if line is None:

@@ -175,10 +175,7 @@ def _neutral_orientation(
 
 
 def _add_links(robot: Any, added: Mapping[str, tuple[str, np.ndarray]]) -> Any:
-    """Fix massless links to those of the robot; ``root`` becomes the link above the one that it names.
-
-    A link of theirs that bears such a name and stands elsewhere becomes ``<name>_link``.
-    """
+    """Fix massless links to those of the robot, ``root`` above its own; a link that has such a name gets ``_link``."""
     yourdfpy = import_yourdfpy()
     own = {link.name for link in robot.links}
     renamed = {name: f"{name}_link" for name in added if name in own}
