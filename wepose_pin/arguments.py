@@ -114,7 +114,7 @@ def _read_hints(function: Any) -> dict[str, Any]:
 
 
 def check_arguments(function: Any, arguments: Mapping[str, Any]) -> None:
-    """Check the arguments of a function against its annotations; raise `BadOption`, or what their own `check` raises."""
+    """Check the arguments of a function against its annotations; raise `BadOption`, or what a `check` raises."""
     for name, hint in _read_hints(function).items():
         if name in arguments:
             check_value(name, arguments[name], hint)

@@ -75,7 +75,7 @@ def render(diagnostic: Diagnostic) -> Text:
 def render_all(
     diagnostics: Iterable[Diagnostic], remedies: Mapping[str, str] = MappingProxyType({})
 ) -> list[tuple[Severity, Text]]:
-    """Put diagnostics in words, the gravest first, alike ones as one; `remedies` replace what the catalogue says to do."""
+    """Put diagnostics in words, the gravest first, alike ones as one; `remedies`: code → another thing to do."""
     alike: dict[tuple[str, Severity, Text], dict[str, str]] = {}  # code, severity, text without `what` → `what` → place
     for diagnostic in gravest_first(diagnostics):
         text = render(diagnostic)

@@ -126,8 +126,7 @@ class BodyModel:
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Implausible lengths."""
-        people, covariance, _ = compute_population_lengths(self.table)
-        diagnostics = []
+        (people, covariance, _), diagnostics = compute_population_lengths(self.table), []
         for (name, mean), std in zip(people.items(), np.sqrt(np.diag(covariance)), strict=True):
             low, high = max(0.0, mean - FAR_OFF * std), mean + FAR_OFF * std
             if not low <= self.lengths[name] <= high:
@@ -249,12 +248,6 @@ def _load(path: str | Path | None, sensors: Collection[str] = (), where: str = "
     return _load_packaged_body(file) if file.parent == default.parent else _load_body(file, sensors, where)
 
 
-@lru_cache
-def _load_packaged_body(path: Path) -> BodyModel:
-    """Return a body of the package, read once; a `BodyModel` does not change."""
-    return _load_body(path)
-
-
 def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> BodyModel:
     """Return the body of a URDF or of a table that names one; a mechanism of the links with sensors where none does."""
     own_table = read_table(path) if path.suffix.lower() == ".toml" else None
@@ -292,6 +285,9 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
     if own_table is not None:  # an error where the table does not give its lengths
         _lengths.with_lengths(body.robot, body.table, {name: 1.1 * value for name, value in body.lengths.items()})
     return body
+
+
+_load_packaged_body = lru_cache(_load_body)  # read once; a `BodyModel` does not change
 
 
 def _build_mechanism(robot: Any, tree: Tree, sensors: Collection[str], urdf: str, where: str) -> BodyModel:

@@ -84,13 +84,9 @@ def find_start_pose(body: BodyModel, recording: Recording) -> StartPose:
 def compute_start_configuration(
     model: BodyModel, start_pose: str, joints: Mapping[str, float], where: str
 ) -> np.ndarray:
-    """Compute `q` (nq,) in the start pose.
+    """Compute `q` (nq,) in the start pose, of the body's table or a "configuration" of joints [rad or m], else at zero.
 
-    Parameters
-    ----------
-    start_pose : a pose of the body's table, or "configuration"
-    joints : joint of the URDF → value [rad or m] in a configuration; those not named are at zero
-    where : begins the text of a `BadSession`: an unknown start pose or joint, a joint outside its limits
+    `where` begins the text of a `BadSession`: an unknown start pose or joint, or one outside its limits.
     """
     poses = {**model.table.poses, CONFIGURATION: joints}
     if start_pose not in poses:

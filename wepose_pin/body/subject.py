@@ -164,14 +164,7 @@ class Subject:
         return self.name == POPULATION
 
     def check(self, where: str = "") -> Subject:
-        """Check all fields and return the subject; `where` begins an error's text.
-
-        Raises
-        ------
-        BadOption, BadSubject
-            A field of a wrong type; a length, mount, hinge, offset or drift with an impossible value; a covariance
-            whose size is not that of `order`.
-        """
+        """Check all fields and return the subject; `where` begins the text of a `BadOption` or `BadSubject`."""
         where = where or f"subject {self.name!r}: "
         check_fields(self, where)
         arrays: dict[str, tuple[Any, int]] = {f"mounts.{name}": (quat, 4) for name, quat in self.mounts.items()}
