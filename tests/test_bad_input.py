@@ -93,166 +93,154 @@ class Files:
         self.table.write_parquet(self.folder / "arm.parquet")
 
 
-CASES: dict[str, tuple[Callable[[Files], object], str]] = {
-    # the session file
-    "broken TOML": (lambda f: f.say("[phases]", "[phases"), "session.toml: not valid TOML: Expected"),
-    "a table without an ending": (lambda f: f.say("arm.csv", "x"), "x: '' is not a known format; there is: .csv"),
-    "unknown key at the top": (lambda f: f.say("\n[data]", "\nnme = 'x'\n[data]"), "session.toml: nme is not a known"),
-    "a phase of an earlier version": (
-        lambda f: f.say("start = [[0.5, 2.5]]", "still = [[0.5, 2.5]]"),
+# What of the session is exchanged for what, and what is said.
+SAYS = [
+    ("[phases]", "[phases", "session.toml: not valid TOML: Expected"),
+    ("arm.csv", "x", "x: '' is not a known format; there is: .csv"),
+    ("\n[data]", "\nnme = 'x'\n[data]", "session.toml: nme is not a known"),
+    (
+        "start = [[0.5, 2.5]]",
+        "still = [[0.5, 2.5]]",
         "session.toml: phases.still is called static now: write static = [[from, to]]",
     ),
-    "unknown key in data": (
-        lambda f: f.say("gyro_unit", "gyr_unit"),
-        "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?",
+    ("gyro_unit", "gyr_unit", "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?"),
+    ('gyro_unit = "rad/s"\n', "", "session.toml: data.gyro_unit is missing; there is: rad/s, deg/s"),
+    ('"m/s^2"', '"m/s2"', "data.accel_unit = 'm/s2' is not known; did you mean 'm/s^2'?"),
+    ("sensors.torso", "sensors.torsoo", "sensors.torsoo is no segment of upper_body; did you mean 'torso'?"),
+    ("[data]", "[sensors.head]", "session.toml: data is missing; a table [data]"),
+    ('file = "arm.csv"\n', "", "session.toml: data.file is missing"),
+    ('accel = ["ax", "ay", "az"]\n', "", "sensors.torso.accel is missing"),
+    (
+        '["gx", "gy", "gz"]',
+        '["gx", "gy"]',
+        "sensors.torso.gyro = ['gx', 'gy']; a list of 3 different column names is needed",
     ),
-    "missing unit": (
-        lambda f: f.say('gyro_unit = "rad/s"\n', ""),
-        "session.toml: data.gyro_unit is missing; there is: rad/s, deg/s",
+    ('time = "time"', "rate_hz = -100.0", "data.rate_hz = -100.0; a number from"),
+    ('time = "time"', 'time = "time"\nrate_hz = 100', "one of the two, and both is"),
+    ('time = "time"\n', "", "one of the two, and neither is there"),
+    (
+        'time = "time"',
+        'time = "time"\noffset_s = -2e12',
+        "data.offset_s = -2000000000000.0; a number from -1e+12 to 1e+12 is needed",
     ),
-    "unknown unit": (
-        lambda f: f.say('"m/s^2"', '"m/s2"'),
-        "data.accel_unit = 'm/s2' is not known; did you mean 'm/s^2'?",
+    (
+        "accel =",
+        "format = 'dot'\naccel =",
+        "sensors.torso.format has no effect, as the columns are named here; remove it",
     ),
-    "unknown segment": (
-        lambda f: f.say("sensors.torso", "sensors.torsoo"),
-        "sensors.torsoo is no segment of upper_body; did you mean 'torso'?",
+    ('forward = "+x"', 'forward = "-z"', "mount.forward = '-z' is parallel to up = '+z'"),
+    (
+        "accel =",
+        'orientation = ["qx", "qy", "qz", "qw"]\naccel =',
+        "sensors.torso.orientation stands beside gyro; a sensor has one",
     ),
-    "no sensors": (lambda f: setattr(f, "session", f.session.split("[sensors")[0]), "session.toml: no sensors; one"),
-    "a sensor that is no table": (
+    ("\n[data]", "\nstart_pose = 'npose'\n[data]", "start_pose = 'npose' is not known; did you mean 'n_pose'?"),
+    ('file = "arm.csv"', 'file = "arm.csv"\ntruth = "t.parquet"', "session.toml: data.truth: no such file 't.parquet'"),
+    (
+        "[[0.5, 2.5]]",
+        "[[0.5, 25.0]]",
+        "session.toml: phases.start: [0.5, 25] is outside the recording, which runs from 0.000 to 8.990 s",
+    ),
+    ("[[0.5, 2.5]]", "[[2.5, 0.5]]", "phases.start: [2.5, 0.5] is empty"),
+    ("[[0.5, 2.5]]", '"begin"', "phases.start = 'begin' is not a list of interv"),
+    ("[[0.5, 2.5]]", "[[0.5, 0.55]]", "phases.start: [0.5, 0.55] holds 6 samples"),
+    (
+        "[[0.5, 2.5]]",
+        "[[4.0, 6.0]]",
+        "session.toml: phases.start: sensors.torso turns at up to 61 deg/s in 4 to 6 s, and less than 1 s of it is",
+    ),
+    ("arm.csv", "amr.csv", "amr.csv: no such file; did you mean 'arm.csv'?"),
+    ('"gz"', '"gyr_z"', "session.toml: sensors.torso.gyro: no column 'gyr_z' in arm.csv; there is: time, gx"),
+    ('time = "time"', 'time = "Time"', "session.toml: data.time: no column 'Time' in arm.csv; did you mean 'time'?"),
+    ('"m/s^2"', '"g"', "norm 96.2 m/s^2 in phases.start (0.5 to 2.5 s), where grav"),
+    ('"rad/s"', '"deg/s"', 'data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong'),
+    ('mount = { up = "+z", forward = "+x" }', "", "sensors.torso.mount is not known"),
+]
+# Column, rows, the value put there, and what is said.
+PUTS = [
+    (
+        "gy",
+        slice(40, 41),
+        "0,125",
+        "arm.csv: column 'gy' holds text in row 41: '0,125'; write decimals with a point: 0.125",
+    ),
+    ("ax", slice(6, 7), "n.v.", "arm.csv: column 'ax' holds text in row 7: 'n.v.'; it must be a number"),
+    ("az", slice(70, 71), float("inf"), "arm.csv: column 'az' holds inf in row 71; it must be a number"),
+    ("gx", slice(None), None, "sensors.torso.gyro: no numbers from 0 to"),
+    (
+        "time",
+        slice(100, 101),
+        0.99,
+        "arm.csv: time stands still in row 101: 0.99 s after 0.99 s; it must grow in every row: delete one of",
+    ),
+    ("time", slice(100, 101), 0.5, "arm.csv: time goes back in row 101: 0.5 s"),
+    ("time", slice(3, 4), None, "arm.csv: time: not a finite number in row 4"),
+    (
+        "gy",
+        slice(400, 406),
+        None,
+        "arm.csv: sensors.torso.gyro: samples are missing for 0.060 s from 4.000 s, after row 400; up to 50 ms",
+    ),
+    ("gz", slice(50, 51), -9999.0, "sensors.torso.gyro: -9999 rad/s on z at 0.500 s, no sensor measures above 80"),
+    ("ax", slice(700, 701), 2**63, "sensors.torso.accel: 9.22337e+18 m/s^2 on x at 7."),
+]
+# Columns, the factor on them, and what is said.
+SCALES = [
+    (
+        "time",
+        1000.0,
+        'arm.csv: time grows by 10 s from row to row, slower than any body sensor; time_unit = "ms" would fit',
+    ),
+    (
+        "ax ay az",
+        1 / 9.81,
+        "sensors.torso.accel: norm 1 m/s^2 in phases.start (0.5 to 2.5 s), where gravity's 9.81 is expected; "
+        'data.accel_unit = "g" would fit',
+    ),
+    ("ax ay az", 1000 / 9.81, 'data.accel_unit = "mg" would fit'),
+    ("ax ay az", 0.001, "gravity seems to have been taken out"),
+    ("gx gy gz", 57.29578, 'data.gyro_unit = "deg/s" would fit'),
+]
+CASES: list[tuple[Callable[[Files], object], str]] = [
+    *((lambda f, old=old, new=new: f.say(old, new), says) for old, new, says in SAYS),
+    *((lambda f, put=put: f.put(*put), says) for *put, says in PUTS),
+    *((lambda f, n=names, by=by: f.scale(n, by), says) for names, by, says in SCALES),
+    (lambda f: setattr(f, "session", f.session.split("[sensors")[0]), "session.toml: no sensors; one"),
+    (
         lambda f: setattr(f, "session", f.session.split("[sensors")[0] + "[sensors]\ntorso = 3"),
         "sensors.torso = 3 is not a table; a table [sensors.torso] is needed",
     ),
-    "no data": (lambda f: f.say("[data]", "[sensors.head]"), "session.toml: data is missing; a table [data]"),
-    "no file": (lambda f: f.say('file = "arm.csv"\n', ""), "session.toml: data.file is missing"),
-    "gyro without accel": (lambda f: f.say('accel = ["ax", "ay", "az"]\n', ""), "sensors.torso.accel is missing"),
-    "two columns for three": (
-        lambda f: f.say('["gx", "gy", "gz"]', '["gx", "gy"]'),
-        "sensors.torso.gyro = ['gx', 'gy']; a list of 3 different column names is needed",
-    ),
-    "a negative rate": (lambda f: f.say('time = "time"', "rate_hz = -100.0"), "data.rate_hz = -100.0; a number from"),
-    "time and rate": (lambda f: f.say('time = "time"', 'time = "time"\nrate_hz = 100'), "one of the two, and both is"),
-    "neither time nor rate": (lambda f: f.say('time = "time"\n', ""), "one of the two, and neither is there"),
-    "an offset beyond all clocks": (
-        lambda f: f.say('time = "time"', 'time = "time"\noffset_s = -2e12'),
-        "data.offset_s = -2000000000000.0; a number from -1e+12 to 1e+12 is needed",
-    ),
-    "columns of another sensor": (
+    (
         lambda f: setattr(f, "session", f.session + f.session[f.session.index("[sensors") :].replace("torso", "head")),
         "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso too",
     ),
-    "a format beside columns": (
-        lambda f: f.say("accel =", "format = 'dot'\naccel ="),
-        "sensors.torso.format has no effect, as the columns are named here; remove it",
-    ),
-    "parallel mount axes": (
-        lambda f: f.say('forward = "+x"', 'forward = "-z"'),
-        "mount.forward = '-z' is parallel to up = '+z'",
-    ),
-    "orientation beside gyro": (
-        lambda f: f.say("accel =", 'orientation = ["qx", "qy", "qz", "qw"]\naccel ='),
-        "sensors.torso.orientation stands beside gyro; a sensor has one",
-    ),
-    "an unknown start pose": (
-        lambda f: f.say("\n[data]", "\nstart_pose = 'npose'\n[data]"),
-        "start_pose = 'npose' is not known; did you mean 'n_pose'?",
-    ),
-    "a truth that is not there": (
-        lambda f: f.say('file = "arm.csv"', 'file = "arm.csv"\ntruth = "t.parquet"'),
-        "session.toml: data.truth: no such file 't.parquet'",
-    ),
-    # phases
-    "a phase outside": (
-        lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 25.0]]"),
-        "session.toml: phases.start: [0.5, 25] is outside the recording, which runs from 0.000 to 8.990 s",
-    ),
-    "an empty phase": (lambda f: f.say("[[0.5, 2.5]]", "[[2.5, 0.5]]"), "phases.start: [2.5, 0.5] is empty"),
-    "a phase in words": (lambda f: f.say("[[0.5, 2.5]]", '"begin"'), "phases.start = 'begin' is not a list of interv"),
-    "a phase with few samples": (
-        lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 0.55]]"),
-        "phases.start: [0.5, 0.55] holds 6 samples",
-    ),
-    "a start phase in motion": (
-        lambda f: f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]"),
-        "session.toml: phases.start: sensors.torso turns at up to 61 deg/s in 4 to 6 s, and less than 1 s of it is",
-    ),
-    # the table
-    "a missing table": (lambda f: f.say("arm.csv", "amr.csv"), "amr.csv: no such file; did you mean 'arm.csv'?"),
-    "a folder for a table": (
-        lambda f: (f.folder / "arm.csv").mkdir(),
-        "arm.csv: is a folder; a table is wanted here",
-    ),
-    "an unknown format": (
+    (lambda f: (f.folder / "arm.csv").mkdir(), "arm.csv: is a folder; a table is wanted here"),
+    (
         lambda f: (f.say("arm.csv", "arm.xlsx"), (f.folder / "arm.xlsx").write_bytes(b"PK")),
         "'.xlsx' is not a known format; there is: .csv, .tsv, .txt, .parquet",
     ),
-    "an unreadable Parquet": (
+    (
         lambda f: (f.say("arm.csv", "arm.parquet"), (f.folder / "arm.parquet").write_bytes(b"no parquet at all")),
         "arm.parquet: cannot be read as a Parquet file",
     ),
-    "an empty file": (lambda f: f.raw(lambda _: ""), "arm.csv: is empty"),
-    "a single sample": (lambda f: setattr(f, "table", f.table.head(1)), "arm.csv: 1 samples; a recording has at least"),
-    "decimal commas": (
-        lambda f: f.put("gy", slice(40, 41), "0,125"),
-        "arm.csv: column 'gy' holds text in row 41: '0,125'; write decimals with a point: 0.125",
-    ),
-    "text in a number": (
-        lambda f: f.put("ax", slice(6, 7), "n.v."),
-        "arm.csv: column 'ax' holds text in row 7: 'n.v.'; it must be a number",
-    ),
-    "a missing column": (
-        lambda f: f.say('"gz"', '"gyr_z"'),
-        "session.toml: sensors.torso.gyro: no column 'gyr_z' in arm.csv; there is: time, gx",
-    ),
-    "a missing time column": (
-        lambda f: f.say('time = "time"', 'time = "Time"'),
-        "session.toml: data.time: no column 'Time' in arm.csv; did you mean 'time'?",
-    ),
-    "a column that stands twice": (
-        lambda f: f.raw(lambda t: t.replace("gz", "gy", 1)),
-        "arm.csv: column 'gy' stands there more than once",
-    ),
-    "a row that breaks off": (
-        lambda f: f.raw(lambda t: t[: t.rindex(",")]),
-        "arm.csv: row 900 has 10 fields, the line of names has 11",
-    ),
-    "UTF-16": (lambda f: f.raw(lambda t: t.encode("utf-16")), "arm.csv: is not a CSV in UTF-8"),
-    "dates for time": (
+    (lambda f: f.raw(lambda _: ""), "arm.csv: is empty"),
+    (lambda f: setattr(f, "table", f.table.head(1)), "arm.csv: 1 samples; a recording has at least"),
+    (lambda f: f.raw(lambda t: t.replace("gz", "gy", 1)), "arm.csv: column 'gy' stands there more than once"),
+    (lambda f: f.raw(lambda t: t[: t.rindex(",")]), "arm.csv: row 900 has 10 fields, the line of names has 11"),
+    (lambda f: f.raw(lambda t: t.encode("utf-16")), "arm.csv: is not a CSV in UTF-8"),
+    (
         lambda f: (setattr(f, "table", f.table.with_columns(time=pl.from_epoch(pl.col("time")))), f.parquet()),
         "arm.parquet: column 'time' holds values of type Datetime",
     ),
-    "infinity": (
-        lambda f: f.put("az", slice(70, 71), float("inf")),
-        "arm.csv: column 'az' holds inf in row 71; it must be a number",
-    ),
-    "a column without numbers": (lambda f: f.put("gx", slice(None), None), "sensors.torso.gyro: no numbers from 0 to"),
-    # time
-    "time that stands still": (
-        lambda f: f.put("time", slice(100, 101), 0.99),
-        "arm.csv: time stands still in row 101: 0.99 s after 0.99 s; it must grow in every row: delete one of",
-    ),
-    "time that goes back": (lambda f: f.put("time", slice(100, 101), 0.5), "arm.csv: time goes back in row 101: 0.5 s"),
-    "time without a number": (
-        lambda f: f.put("time", slice(3, 4), None),
-        "arm.csv: time: not a finite number in row 4",
-    ),
-    "time in milliseconds": (
-        lambda f: f.scale("time", 1000.0),
-        'arm.csv: time grows by 10 s from row to row, slower than any body sensor; time_unit = "ms" would fit',
-    ),
-    "a jump in time": (
+    (
         lambda f: setattr(f, "table", f.table.with_columns(time=pl.col("time") + 1e6 * (pl.col("time") > 5))),
         "arm.csv: time jumps from 5 to 1000005.01 s in row 502",
     ),
-    "missing rows": (
+    (
         lambda f: setattr(f, "table", pl.concat([f.table.head(300), f.table.slice(307)])),
         "arm.csv: sensors.torso.gyro: samples are missing for 0.070 s from 3.000 s, after row 300; up to 50 ms",
     ),
-    "a long gap in gyro": (
-        lambda f: f.put("gy", slice(400, 406), None),
-        "arm.csv: sensors.torso.gyro: samples are missing for 0.060 s from 4.000 s, after row 400; up to 50 ms",
-    ),
-    "clocks that do not overlap": (
+    (
         lambda f: setattr(
             f,
             "session",
@@ -260,36 +248,17 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
         ),
         "session.toml: the sensors' clocks do not overlap (torso 0 to 8.99 s, head 99 to 107.99 s)",
     ),
-    # values
-    "a quaternion that is no unit": (
+    (
         lambda f: (setattr(f, "session", QUATS), f.put("qw", slice(4, 5), 0.5)),
         "arm.csv: sensors.torso.orientation has length 0.5 in row 5; a unit quaternion x, y, z, w is needed",
     ),
-    "accel in g": (
-        lambda f: f.scale("ax ay az", 1 / 9.81),
-        "sensors.torso.accel: norm 1 m/s^2 in phases.start (0.5 to 2.5 s), where gravity's 9.81 is expected; "
-        'data.accel_unit = "g" would fit',
-    ),
-    "accel not in g": (lambda f: f.say('"m/s^2"', '"g"'), "norm 96.2 m/s^2 in phases.start (0.5 to 2.5 s), where grav"),
-    "accel in mg": (lambda f: f.scale("ax ay az", 1000 / 9.81), 'data.accel_unit = "mg" would fit'),
-    "accel without gravity": (lambda f: f.scale("ax ay az", 0.001), "gravity seems to have been taken out"),
-    "gyro in deg/s": (lambda f: f.scale("gx gy gz", 57.29578), 'data.gyro_unit = "deg/s" would fit'),
-    "gyro not in deg/s": (
-        lambda f: f.say('"rad/s"', '"deg/s"'),
-        'data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
-    ),
-    "a number for a missing value": (
-        lambda f: f.put("gz", slice(50, 51), -9999.0),
-        "sensors.torso.gyro: -9999 rad/s on z at 0.500 s, no sensor measures above 80",
-    ),
-    "an overflow": (lambda f: f.put("ax", slice(700, 701), 2**63), "sensors.torso.accel: 9.22337e+18 m/s^2 on x at 7."),
-    "no mount": (lambda f: f.say('mount = { up = "+z", forward = "+x" }', ""), "sensors.torso.mount is not known"),
-}
+]
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_bad_input_is_told_in_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    spoil, message = CASES[name]
+@pytest.mark.parametrize(("spoil", "message"), CASES)
+def test_bad_input_is_told_in_one_line(
+    spoil: Callable[[Files], object], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     files = Files(tmp_path / "in", good_table())
     files.folder.mkdir()
     spoil(files)

@@ -107,14 +107,6 @@ def test_csv_leaves_empty_what_is_not_known(tmp_path: Path, pose: Pose) -> None:
     assert "NaN" not in (tmp_path / "x.csv").read_text()
 
 
-def test_a_table_without_a_joint_has_the_pose_alone(tmp_path: Path) -> None:
-    lone = a_pose(("right_forearm",), n=5)
-    export(write_folder(tmp_path / "r", lone), tmp_path / "x.parquet")
-    table = pl.read_parquet(tmp_path / "x.parquet")
-    assert "right_forearm_qx" in table.columns
-    assert not any(name.endswith("_deg") for name in table.columns)
-
-
 # C3D --------------------------------------------------------------------------------------------------------------
 
 
@@ -159,17 +151,6 @@ def test_c3d_marks_what_hangs_on_a_gap(tmp_path: Path, pose: Pose) -> None:
         segment: np.flatnonzero(lost[0, 0, k]).tolist() for k, segment in enumerate(pose.quat_WL) if lost[:, :, k].any()
     }
     assert hit == {name: list(range(10, 20)) for name in ("right_forearm", "right_hand")}
-
-
-def test_c3d_of_a_segment_whose_place_is_not_known_has_its_rotation(tmp_path: Path) -> None:
-    ezc3d = pytest.importorskip("ezc3d")
-    lone = a_pose(("torso", "right_forearm"), n=5)
-    export(write_folder(tmp_path / "r", lone), tmp_path / "x.c3d")
-    file = ezc3d.c3d(str(tmp_path / "x.c3d"))
-    k = file["parameters"]["ROTATION"]["LABELS"]["value"].index("right_forearm_4X4")
-    R_WL = Rotation.from_quat(lone.quat_WL["right_forearm"]).as_matrix()
-    np.testing.assert_allclose(file["data"]["rotations"][:3, :3, k].transpose(2, 0, 1), R_WL, atol=1e-7)
-    np.testing.assert_array_equal(file["data"]["rotations"][:3, 3, k], 0.0)
 
 
 # BVH --------------------------------------------------------------------------------------------------------------
@@ -383,10 +364,3 @@ def test_no_result_and_no_points(tmp_path: Path) -> None:
     short = write_folder(tmp_path / "s", a_pose(n=1))
     with pytest.raises(BadData, match="1 samples; a motion has at least 2"):
         export(short, tmp_path / "x.csv")
-
-
-def test_the_command_says_what_it_wrote(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("export", result, "-o", tmp_path / "x.mot") == 0
-    captured = capsys.readouterr()
-    assert captured.out == f"Written: {tmp_path / 'x.mot'}  (mot)\n"
-    assert captured.err.startswith("warning: The orientation of ")

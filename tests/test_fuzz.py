@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.targets import NUMBERS, TARGETS, Target, try_one
+from fuzz.targets import TARGETS, WORDS, Target, try_one
 
 WORD = re.compile(rb'[\w.+-]+|"[^"]*"')
 EXAMPLES = {"retarget": 8}  # of a target that takes its time
@@ -19,11 +19,11 @@ EXAMPLES = {"retarget": 8}  # of a target that takes its time
 
 def spoil(target: Target, random: np.random.Generator) -> bytes:
     """A well-formed input with some edits: bits turned over, words put in or exchanged, lines doubled, ends cut off."""
-    seeds, words = target.seeds(), target.words or NUMBERS
+    seeds = target.seeds()
     data = bytearray(seeds[random.integers(len(seeds))])
     for _ in range(random.integers(1, 6)):
         at = int(random.integers(len(data) + 1))
-        word = words[random.integers(len(words))]
+        word = WORDS[random.integers(len(WORDS))]
         edit = random.choice(["flip", "delete", "insert", "exchange", "double", "cut"])
         if edit == "flip" and at < len(data):
             data[at] ^= 1 << int(random.integers(8))

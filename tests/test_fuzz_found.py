@@ -40,7 +40,7 @@ TOMLS = {"session": BadSession, "subject": BadSubject, "table": BadModel, "robot
 
 
 @pytest.mark.parametrize("name", TOMLS)
-@pytest.mark.parametrize("text", [b"a = " + b"9" * 5000, b"a = " + b"[" * 3000, b"a = '\xff'"])
+@pytest.mark.parametrize("text", [b"a = " + b"9" * 5000, b"a = '\xff'"])
 def test_toml_that_python_gives_up_on(name: str, text: bytes, tmp_path: Path) -> None:
     kind = (TOMLS[name], MissingFile)
     assert isinstance(try_one(BY_NAME[name], tmp_path, text), kind)

@@ -10,14 +10,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from bodies import RIGID_SHOULDERS
 from commands import run
 from device_files import MVN_SEGMENTS, mvnx, turning
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin import BadData, BadSession, MissingFile
-from wepose_pin.body.kinematics import compute_pose
 from wepose_pin.tracking import track
 from wepose_pin.writers import write_session
 
@@ -135,21 +133,6 @@ def test_a_subject_from_an_mvnx_is_a_prior_with_the_lengths_as_they_are(
         for segment, upper, lower in (("upper arm", *arm[:2]), ("forearm", *arm[1:])):
             length = 1e3 * np.median(np.linalg.norm(lower - upper, axis=1))
             assert re.search(rf"{side} {segment} .* {length:.1f} ± 10\.0", printed), printed
-
-
-def test_one_rigid_trunk_costs_millimetres_at_the_shoulders(tracked) -> None:
-    """Against Xsens's spine of four joints and its moving shoulder girdle, the line between the shoulders aside."""
-    pose, xsens = tracked
-    ours = pose.points["left_shoulder"] - pose.points["right_shoulder"]
-    theirs = xsens["LeftUpperArm"] - xsens["RightUpperArm"]
-    each = 0.5 * np.linalg.norm(ours - theirs, axis=1)  # of a shoulder to the middle of both
-    assert each.max() < 0.007
-    # With shoulders that stay on the torso it costs more.
-    still = compute_pose(replace(pose.model, girdles=RIGID_SHOULDERS), pose.time, pose.quat_WL).points
-    without = 0.5 * np.linalg.norm(still["left_shoulder"] - still["right_shoulder"] - theirs, axis=1)
-    print(f"{1e3 * each.mean():.2f} mm, {1e3 * without.mean():.2f} mm without")
-    assert each.mean() < without.mean()
-    assert 0.003 < without.mean() < 0.007
 
 
 def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
