@@ -58,7 +58,7 @@ package: $(READY)         ## wheel and sdist in dist/, checked
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
 
-OLDEST_TESTS ?= filters kinematics model readers calibration solver angles report tables export subject static writers evaluation
+OLDEST_TESTS ?= filters kinematics model readers calibration angles report tables export subject static writers evaluation
 oldest:                   ## tests with the oldest versions that pyproject.toml allows, in .venv-oldest
 	$(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/python -m pip install --quiet -c tests/oldest.txt . pytest pytest-xdist pillow

@@ -360,25 +360,6 @@ def test_meshes_are_named_and_not_read(tmp_path: Path, caplog: pytest.LogCapture
     assert caplog.records == []
 
 
-def test_a_human_with_such_textures_has_wrists_and_no_hands(data: Path, tmp_path: Path) -> None:
-    """Its table gives wrists as places on the forearms."""
-    segments, points = {"torso": "torso", "pelvis": "pelvis"}, []
-    for side, letter in (("left", "L"), ("right", "R")):
-        segments |= {f"{side}_upper_arm": f"upperarm{letter}", f"{side}_forearm": f"lowerarm{letter}"}
-        points.append(f'{side}_wrist = {{ link = "lowerarm{letter}", at = [0.0, -0.26, 0.0] }}')
-    top = f'urdf = "{data / "human_urdf" / "cosmik_human.urdf"}"\nup = "+y"\nroot = "pelvis"\n'
-    more = "[points]\n" + "\n".join(points)
-    body = load_model(written(tmp_path, top + table_toml(segments, more), "cosmik.toml"))
-    # Its links are turned by 1.57 in place of a quarter turn.
-    assert body.lengths["left_upper_arm"] == pytest.approx(0.2737, abs=1e-4)
-    assert body.lengths["left_forearm"] == pytest.approx(0.26)
-    assert "left_hand" not in body.lengths
-    with pytest.raises(WeposeError) as raised:
-        load_model(data / "human_urdf" / "cosmik_human.urdf")
-    for name in ("left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm", "upperarmL"):
-        assert name in str(raised.value)
-
-
 @pytest.mark.parametrize("change", [{"left_upper_arm": 1.10}, {"trunk": 0.1}, {}])
 def test_implausible_lengths_are_warned_of(change: dict[str, float]) -> None:
     diagnostics = load_model(lengths=change).diagnostics
@@ -481,28 +462,3 @@ def test_up_and_forward_turn_the_body_upright(tmp_path: Path) -> None:
     at = link_placements(body.pin, pin.neutral(body.pin))
     np.testing.assert_allclose(at["base"][:3, :3] @ [0.0, -1.0, 0.0], [1.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(at["torso"][:3, :3], np.eye(3), atol=1e-12)
-
-
-BAD_TABLES = {
-    "no toml": ("segments = [", "not valid TOML"),
-    "no segments": ("[segments]\n", "segments is missing"),
-    "unknown point": (table_toml(more='[draw]\npaths = ["left_elbo"]'), "did you mean 'left_elbow'"),
-    "unknown axis": ('up = "z"\n' + table_toml(), "up = 'z'"),
-    "parallel axes": ('up = "+x"\n' + table_toml(), "is parallel to up"),
-    "no number": (table_toml(more='[points]\nleft_palm = {link = "torso", at = [1, 2]}'), "3 numbers [m]"),
-    "no name": (table_toml(more="[points]\nleft_palm = 3"), "points.left_palm = 3 is not a table"),
-    "half": (table_toml(OTHER | {"torso": '{link = "L_torso", up = "+z"}'}), "torso.forward is missing"),
-    "no link": (table_toml(OTHER | {"torso": "L_troso"}), "segments.torso: no link 'L_troso'; did you mean 'L_torso'"),
-    "root": ('root = "hips"\n' + table_toml(), "root: no link 'hips'"),
-    "one place": (table_toml(more='[points]\nleft_elbow = "L_left_upper_arm"'), "lie in one place"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_TABLES)
-def test_a_wrong_table_says_so_in_one_line(case: str, tmp_path: Path) -> None:
-    text, message = BAD_TABLES[case]
-    written(tmp_path, other_names(small()))
-    with pytest.raises(WeposeError) as raised:
-        load_model(written(tmp_path, 'urdf = "small.urdf"\n' + text, "table.toml"))
-    assert message in str(raised.value)
-    assert "\n" not in str(raised.value)

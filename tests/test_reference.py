@@ -338,14 +338,6 @@ def test_a_table_of_markers_of_ones_own(brief: Pose, tmp_path: Path) -> None:
             read_reference(path, tmp_path / "m.toml")
 
 
-def test_an_mvnx_is_a_reference(tmp_path: Path) -> None:
-    """Its segments are brought to our frames; its world has z up."""
-    reference = read_reference(mvnx(tmp_path, turning(100)))
-    assert reference.up == "+z"
-    assert {"torso", "left_forearm"} <= set(reference.quat_VT)
-    assert reference.diagnostics == ()
-
-
 def test_an_mvnx_without_its_t_pose_is_a_reference_with_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -357,27 +349,6 @@ def test_an_mvnx_without_its_t_pose_is_a_reference_with_a_warning(
     capsys.readouterr()
     assert run("evaluate", tmp_path / "result", file, "--no-align") == 0
     assert "warning: trial.mvnx has no frame of type tpose" in capsys.readouterr().err
-
-
-def test_a_real_mvnx_agrees_with_what_is_tracked_of_it(
-    data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    file = data / "mvnx" / "test_mocap.mvnx"
-    labels = {
-        "T8": "torso",
-        "LeftUpperArm": "left_upper_arm",
-        "RightForeArm": "right_forearm",
-        "RightUpperArm": "right_upper_arm",
-        "LeftForeArm": "left_forearm",
-    }
-    sensors = "".join(f'[sensors.{segment}]\nlabel = "{label}"\n' for label, segment in labels.items())
-    (tmp_path / "session.toml").write_text(f"[data]\nfile = '{file}'\nuse = 'orientation'\n{sensors}")
-    ended = run("track", tmp_path / "session.toml", "--subject", file, "-o", tmp_path / "result")
-    assert ended == 0, capsys.readouterr().err
-    capsys.readouterr()
-    out = run_evaluate(capsys, tmp_path / "result", file, "--no-align")
-    assert "right_elbow" in out
-    assert "6 s are needed, or --no-align" in run_evaluate(capsys, tmp_path / "result", file, code=2)
 
 
 # Files that are wrong -----------------------------------------------------------------------------------------------

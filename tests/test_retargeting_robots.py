@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arms import FORE, HAND, UPPER, is_sound, person
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
@@ -92,34 +90,3 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
     trajectory = retargeting.retarget(pose, robot)
     is_sound(trajectory)
     assert not trajectory.run.report.stopping.any()
-
-
-def wandering(seed: int, seconds: float) -> Pose:
-    """A right arm whose joints go from one random angle to another every two seconds, up to the ends of their range."""
-    time = np.arange(0.0, seconds, 0.01)
-    rng, knots = np.random.default_rng(seed), np.arange(0.0, time[-1] + 8.0, 2.0)
-
-    def wander(low: float, high: float) -> np.ndarray:
-        angle = PchipInterpolator(knots, rng.uniform(low, high, len(knots)))(time)
-        return np.radians(gaussian_filter1d(angle, 12.0))
-
-    flexion, abduction, turn, elbow, roll = (
-        wander(*ends) for ends in ((-40, 175), (-30, 120), (-80, 80), (3, 145), (-90, 90))
-    )
-    upper = Rotation.from_euler("YXZ", np.column_stack([-flexion, -abduction, turn]))
-    fore = upper * Rotation.from_euler("YZ", np.column_stack([-elbow, roll]))
-    points = {"right_shoulder": np.tile([0.0, -0.19, 0.45], (len(time), 1))}
-    points["right_elbow"] = points["right_shoulder"] + upper.apply([0.0, 0.0, -UPPER])
-    points["right_wrist"] = points["right_elbow"] + fore.apply([0.0, 0.0, -FORE])
-    points["right_palm"] = points["right_wrist"] + fore.apply([0.0, 0.0, -HAND])
-    torso = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
-    return Pose(time, {"torso": torso, "right_upper_arm": upper.as_quat(), "right_forearm": fore.as_quat()}, points)
-
-
-def test_a_hand_that_its_arm_cannot_follow_is_said() -> None:
-    """From the rest posture the first axis winds up until its limit of a turn stops it."""
-    trajectory = retargeting.retarget(wandering(5, 40.0), "ur5")
-    is_sound(trajectory)
-    missed = retargeting.find_missed_targets(trajectory)
-    assert max(target.error for target in missed) > 0.3
-    assert all(target.span[1] - target.span[0] > 0.4 and target.side == "right" for target in missed)
