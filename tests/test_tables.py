@@ -57,7 +57,7 @@ TABLES: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("hinges.bend.on", "uper_arm_link", "did you mean 'upper_arm_link'"),
     ),
     ('[pairs]\nelbow = "tipp"\n', ("", ""), ("pairs", "'tipp' is not known", "did you mean 'tip'")),
-    ("", ("0.15", "150.0"), ("points.tip.at", "150.0", "numbers [m] from -10 to 10")),
+    ("", ("0.15", "150.0"), ("points.tip.at", "150.0", "[m] from -10 to 10")),
     (GIRDLE, ("girdles.elbow", "girdles.elbov"), ("girdles", "'elbov' is not known", "did you mean 'elbow'")),
     (GIRDLE, (', "elbow_joint"', ""), ("['shoulder_pan_joint', 'shoulder_lift_joint']", "three names")),
     (GIRDLE + "law_std = -0.5\n", ("", ""), ("girdles.elbow.law_std = -0.5", "from 0 on")),
