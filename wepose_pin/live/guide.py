@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
 from ..body.kinematics import KinematicsSolver
-from ..body.subject import Subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
 from ..errors import BadOption
@@ -85,7 +84,7 @@ class GuideOptions:
         return calibrate(
             recording,
             measured={name: value for name, value in lengths.items() if name != STATURE},
-            prior=self._earlier,
+            prior=None if self.subject is None else read_subject(self.subject),
             stature=lengths.get(STATURE, self.stature),
             sex=self.sex,
             protocol=choose_parts(self.protocol, recording.phases),
@@ -106,10 +105,6 @@ class GuideOptions:
             write_calibration(partial, calibration, collect_provenance("calibrate", stated))
         write_calibration_page(folder, calibration, recording, method=self.method)
         return calibration
-
-    @cached_property
-    def _earlier(self) -> Subject | None:
-        return None if self.subject is None else read_subject(self.subject)
 
 
 def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str:
@@ -347,7 +342,7 @@ class Attempt:
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
         header = self._header | {"sensors": [*self.segments.values()], "phases": self._phases()}
-        return check_recording(build_recording(header, self.stream.rate_hz, self._ticks, None, self.path))
+        return check_recording(build_recording(header, self.stream.clock.rate_hz, self._ticks, None, self.path))
 
     def _phases(self) -> dict[str, Any]:
         return self._markers.phases(float(self._ticks[0].time[0]), self.newest) if self._ticks else {}

@@ -138,10 +138,12 @@ class LiveLoop(Stage):
             if self.log.path is not None and not self._poses:
                 self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
                 self.log.path = None
-            if self._end_message:  # when the recording is complete
-                self.send_status()
-            for output in self.outputs:
-                output.close()
+            try:
+                if self._end_message:  # when the recording is complete
+                    self.send_status()
+            finally:
+                for output in self.outputs:
+                    output.close()
         counts = {}
         for name, row in zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True):
             counts[name] = dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.missing[name]}
@@ -196,7 +198,7 @@ class LiveLoop(Stage):
 
     def _update_std(self, estimator: SegmentEstimator, tick: int) -> None:
         """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
-        period = max(1, round(self.STATUS_PERIOD_S * self._stream.rate_hz))  # ticks from one to the next
+        period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))  # ticks from one to the next
         if tick % period == 0:
             self._covariance = estimator.covariance_gradually()
         for covariance in itertools.islice(self._covariance, math.ceil((len(self._std) + 2) / period)):
@@ -206,7 +208,9 @@ class LiveLoop(Stage):
     def _start_tracking(self, begin: int, end: int) -> SegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
         assert self._search is not None
-        recording = build_recording(self._header, self._stream.rate_hz, self._search.ticks, (begin, end), last=end)
+        recording = build_recording(
+            self._header, self._stream.clock.rate_hz, self._search.ticks, (begin, end), last=end
+        )
         diagnostics = check_units(recording, self.source)
         self._tracker.push(recording)
         estimator = self._tracker.segment_estimator
@@ -215,7 +219,7 @@ class LiveLoop(Stage):
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])
         self.log.event("start", begin=begin, end=end)
-        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, self._stream.rate_hz)
+        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, self._stream.clock.rate_hz)
         for output in self.outputs:
             output.start(info)
         return estimator
@@ -251,7 +255,7 @@ class LiveLoop(Stage):
             else:
                 phase = self._open_phases.pop(action.name)
             # It begins with the next tick: the ticks before have been tracked without it.
-            time_s = self._stream.newest + (1.0 / self._stream.rate_hz if begins else 0.0)
+            time_s = self._stream.newest + (1.0 / self._stream.clock.rate_hz if begins else 0.0)
             self.log.event("begin" if begins else "end", phase=phase, time=time_s)
             self._estimator.mark_phase(phase, begins=begins)
         else:

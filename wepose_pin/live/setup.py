@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -130,10 +131,6 @@ class AssignedSource(Source):
     def orientations(self) -> dict[str, bool]:
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
 
-    @property
-    def batteries(self) -> dict[str, float]:
-        return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
-
     def open(self) -> None:
         if self._is_open:
             while self.source.read(0.0):
@@ -146,6 +143,7 @@ class AssignedSource(Source):
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         samples = self.source.read(timeout_s)
+        self.batteries = {own: self.source.batteries.get(name, math.nan) for name, own in self.segments.items()}
         return None if samples is None else self.rename(samples)
 
     def rename(self, samples: Iterable[Samples]) -> list[Samples]:

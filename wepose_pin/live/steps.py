@@ -226,7 +226,7 @@ def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
                 moved = moved if pose.state == "moved" else ""
                 if row is not None:
                     last = float(ticks.time[row])
-                    first = last - seconds + 1.0 / attempt.stream.rate_hz
+                    first = last - seconds + 1.0 / attempt.stream.clock.rate_hz
                     try:
                         check_units(replace(attempt.recording(), phases={"static": ((first, last),)}), guide.source)
                     except BadData as error:

@@ -135,17 +135,13 @@ class TickStream:
         self._waiting: list[Arrivals] = []
 
     @property
-    def rate_hz(self) -> float:
-        return self.clock.rate_hz
-
-    @property
     def newest(self) -> float:
         """Time [s] of the newest tick."""
         return self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
 
     def detect_start_pose(self, hold_s: float = START_POSE_HOLD_S) -> StartPoseDetector:
         measured = np.array([name in self.orientations for name in self.sensors], dtype=np.bool_)
-        return StartPoseDetector(self.rate_hz, measured, hold_s)
+        return StartPoseDetector(self.clock.rate_hz, measured, hold_s)
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record the samples of one read, and iterate over the ticks that they complete."""
@@ -197,7 +193,7 @@ class StartPoseSearch:
         """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
         self.ticks.append(ticks)
         if self._stated is not None:
-            rate_hz = self._stream.rate_hz
+            rate_hz = self._stream.clock.rate_hz
             (row,) = np.nonzero(ticks.time >= self._stated[1] - 0.5 / rate_hz)
             if row.size:
                 begin = round((self._stated[0] - self.ticks[0].time[0]) * rate_hz)

@@ -80,13 +80,10 @@ class Source(ABC):
     def __init__(self, sensors: Iterable[str] = (), rate_hz: float | None = None) -> None:
         self.sensors, self.rate_hz = tuple(sensors), rate_hz
         self.problems: dict[str, int] = Counter()
+        self.batteries: dict[str, float] = {}
 
     @property
     def orientations(self) -> Mapping[str, bool]:
-        return {}
-
-    @property
-    def batteries(self) -> Mapping[str, float]:
         return {}
 
     def describe_awaited(self) -> str:

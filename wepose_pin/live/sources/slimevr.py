@@ -45,7 +45,6 @@ class Tracker:
     mac: str  # six bytes as text, or empty where the tracker has not told it
     number: int = 0  # of its newest packet
     places: dict[int, str] = field(default_factory=dict)  # sensor → segment by its place on the body
-    battery: float = math.nan  # share, 0 to 1; NaN: not known
 
 
 def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
@@ -75,12 +74,6 @@ class SlimeVrSource(DatagramSource):
     @property
     def orientations(self) -> dict[str, bool]:
         return dict.fromkeys(self.sensors, False)
-
-    @property
-    def batteries(self) -> dict[str, float]:
-        charged = [tracker for tracker in self._trackers.values() if math.isfinite(tracker.battery)]
-        named = [(self._find_segment(each, sensor), each.battery) for each in charged for sensor in each.places or (0,)]
-        return {segment: share for segment, share in named if segment is not None}
 
     def serve(self, now: float) -> None:
         if now - self._heartbeat >= HEARTBEAT_S:
@@ -137,7 +130,9 @@ class SlimeVrSource(DatagramSource):
         elif kind == PING:
             self.send(datagram, sender)
         elif kind == BATTERY:
-            tracker.battery = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
+            share = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
+            names = [self._find_segment(tracker, sensor) for sensor in tracker.places or (0,)]
+            self.batteries |= {name: share for name in names if name is not None}
         elif kind == ROTATION and data[1] == NORMAL:
             segment = self._find_segment(tracker, data[0])
             if segment is not None:

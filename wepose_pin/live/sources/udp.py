@@ -186,12 +186,8 @@ class UdpSource(DatagramSource):
         units: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(host, port, sensors, segments)
-        self._units, self._batteries = {**SI, **(units or {})}, dict[str, float]()
+        self._units = {**SI, **(units or {})}
         self._clocks: dict[Any, HostClock] = {}  # of each sender
-
-    @property
-    def batteries(self) -> dict[str, float]:
-        return self._batteries
 
     def explain_unit(self, key: str, unit: str) -> str:
         host, port = self.address
@@ -209,7 +205,7 @@ class UdpSource(DatagramSource):
                 else:
                     by_sender.setdefault(sender, []).append(batch)
                     if math.isfinite(batch.battery):
-                        self._batteries[batch.sensor] = batch.battery
+                        self.batteries[batch.sensor] = batch.battery
         samples: list[Samples] = []
         for sender, batches in by_sender.items():
             if len(self._clocks) >= MAX_CLOCKS:
