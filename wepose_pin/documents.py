@@ -35,7 +35,7 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # some editors write a byte-order mark
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read: {failure.strerror}") from failure
-    except ValueError as failure:
+    except (ValueError, RecursionError) as failure:
         raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}; {what} is wanted here") from failure
 
 
