@@ -143,8 +143,10 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             (GYRO, (gyro_S,), of_gyro, STUCK_S),
             (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
-            runs = np.array(find_runs(repeats)).reshape(-1, 2) if repeats.any() else np.zeros((0, 2), dtype=int)
-            first, last = runs.T - 1
+            count = max(0, len(repeats) - FROZEN_SAMPLES + 2)
+            if not np.logical_and.reduce([repeats[k : k + count] for k in range(FROZEN_SAMPLES - 1)]).any():
+                continue
+            first, last = np.array(find_runs(repeats)).T - 1
             length = last - first + 1
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             if not long.any():
@@ -163,7 +165,9 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
                     covered[a : b + 1] = True
                     # At the beginning of the recording the first sample is faulty, too.
                     begin = float(time[a] if a else np.nextafter(time[a], -np.inf))
-                    faults.setdefault(name, []).append(Fault(signals, begin, float(time[b]), tuple(columns[0][a])))
+                    faults.setdefault(name, []).append(
+                        Fault(signals, begin, float(time[b]), tuple(columns[0][a].tolist()))
+                    )
         if name in faults:
             faults[name].sort(key=lambda fault: fault.first)
     return faults
