@@ -208,9 +208,8 @@ class LiveLoop(Stage):
     def _start_tracking(self, begin: int, end: int) -> SegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
         assert self._search is not None
-        recording = build_recording(
-            self._header, self._stream.clock.rate_hz, self._search.ticks, (begin, end), last=end
-        )
+        rate_hz = self._stream.clock.rate_hz
+        recording = build_recording(self._header, rate_hz, self._search.ticks, (begin, end), last=end)
         diagnostics = check_units(recording, self.source)
         self._tracker.push(recording)
         estimator = self._tracker.segment_estimator
@@ -219,7 +218,7 @@ class LiveLoop(Stage):
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])
         self.log.event("start", begin=begin, end=end)
-        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, self._stream.clock.rate_hz)
+        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
         for output in self.outputs:
             output.start(info)
         return estimator
