@@ -125,19 +125,6 @@ def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
         estimate_segments(recording, subject)
 
 
-def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
-    headings = {"torso": 0.2, "left_upper_arm": -0.1}
-    recording, _ = ready_recording(headings, dict.fromkeys(headings, MOUNT))
-    sensors = {name: replace(s, stated_quat_LS=MOUNT.as_quat()) for name, s in recording.sensors.items()}
-    wrong = (Rotation.from_rotvec([0, 0, 1.0]) * MOUNT).as_quat()
-    subject: Subject = replace(population_subject(), mounts=dict.fromkeys(headings, wrong))
-    kept = estimate_segments(replace(recording, sensors=sensors), subject)
-    new = estimate_segments(replace(recording, sensors=sensors, remounted=True), subject)
-    for name in headings:
-        assert new.heading_offset[name] == pytest.approx(headings[name], abs=1e-9)
-        assert kept.heading_offset[name] == pytest.approx(headings[name] + 1.0, abs=1e-9)
-
-
 def test_a_mount_that_contradicts_gravity_and_one_that_is_missing(simulation: Simulation) -> None:
     recording = simulation.recording()
     wrong = replace(recording.sensors["torso"], stated_quat_LS=compute_mount("-x", "+z"))

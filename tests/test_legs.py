@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,16 +16,7 @@ import wepose_pin as wp
 from wepose_pin import NOISE_FREE, Simulation, WeposeError, evaluate, joint_angles, load_model, simulate_activity
 from wepose_pin.commands.evaluate import evaluate as evaluate_result
 
-URDF = Path(__file__).resolve().parent.parent / "urdf"
 SIDES = ("left", "right")
-
-
-def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:
-    """Kind and name → element of a URDF, without the space between elements."""
-    root = ET.parse(URDF / name).getroot()
-    for element in root.iter():
-        element.text = element.tail = None
-    return {(element.tag, element.get("name")): element for element in root}
 
 
 @pytest.fixture(scope="module", params=["walk", "sit", "run", "throw"])
@@ -40,24 +29,6 @@ def made(activity: str) -> Simulation:
     return simulate_activity(
         activity, seed=2, noise=NOISE_FREE, seconds=10.0, rate_hz=400.0 if activity == "run" else 100.0
     )
-
-
-# The model --------------------------------------------------------------------------------------------------------
-
-
-def test_the_upper_body_is_that_of_its_own_urdf() -> None:
-    upper, whole = parts("upper_body.urdf"), parts("whole_body.urdf")
-    for key, element in upper.items():
-        if key == ("link", "pelvis"):  # the stumps where the legs begin
-            element = copy.deepcopy(element)
-            stumps = element.findall("visual")[-2:]
-            assert all(float(stump.find("origin").get("xyz").split()[2]) < -0.05 for stump in stumps)
-            for stump in stumps:
-                element.remove(stump)
-        assert ET.tostring(whole[key]) == ET.tostring(element), key
-    more = {name for kind, name in set(whole) - set(upper) if kind in ("link", "joint")}
-    assert all(name.startswith(("left_", "right_")) for name in more)
-    assert [key for key in whole if key in upper] == list(upper)
 
 
 # Activities -------------------------------------------------------------------------------------------------------

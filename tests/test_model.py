@@ -323,30 +323,6 @@ def test_three_orthogonal_axes_in_any_order_are_one_spherical_joint(
         )
 
 
-@pytest.mark.parametrize("what", ["oblique", "apart", "heavy", "branched", "prismatic"])
-def test_what_is_no_spherical_joint_stays_as_it_is(what: str, tmp_path: Path) -> None:
-    elbow = triple("left_upper_arm", "left_forearm", "0 0 -0.3")
-    more = ""
-    if what == "oblique":
-        elbow = elbow.replace('axis xyz="0 1 0"', 'axis xyz="0.1 1 0"')
-    elif what == "apart":
-        elbow = elbow.replace('xyz="0 0 0" rpy', 'xyz="0 0 -0.01" rpy', 1)
-    elif what == "heavy":
-        inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-        heavy = f'<link name="left_forearm_1"><inertial><mass value="0.1"/>{inertia}</inertial></link>'
-        elbow = elbow.replace('<link name="left_forearm_1"/>', heavy)
-    elif what == "branched":
-        more = '<link name="mark"/>' + fixed("left_forearm_0", "mark", "0 0 0.1")
-    elif what == "prismatic":
-        elbow = elbow.replace('name="left_forearm_j2" type="revolute"', 'name="left_forearm_j2" type="prismatic"')
-    text = small(elbow=elbow, more=more)
-    body = load_model(written(tmp_path, text))
-    assert "left_forearm" not in body.joints
-    assert {"left_forearm_j0", "left_forearm_j1"} <= set(body.pin.names)
-    worst, _ = largest_difference(text, body)
-    assert worst < 1e-12
-
-
 def test_meshes_are_named_and_not_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     mesh = (
         '<visual><geometry><mesh filename="package://nowhere/arm.stl" scale="0.001 0.001 0.001"/></geometry></visual>'

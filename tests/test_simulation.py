@@ -71,19 +71,6 @@ def test_palms_coincide_in_the_clasp(perfect: Simulation) -> None:
     assert np.abs(turn).max() < 15
 
 
-@pytest.mark.parametrize("side", SIDES)
-def test_elbow_is_a_hinge_about_minus_y(perfect: Simulation, side: str) -> None:
-    R_WU = Rotation.from_quat(perfect.quat_WL[f"{side}_upper_arm"])
-    R_WF = Rotation.from_quat(perfect.quat_WL[f"{side}_forearm"])
-    forearm_U = R_WU.inv().apply(R_WF.apply([0.0, 0.0, -1.0]))
-    assert np.abs(forearm_U[:, 1]).max() < 1e-12  # no carrying angle
-    angle = np.arctan2(forearm_U[:, 0], -forearm_U[:, 2])
-    assert angle.min() > -1e-12  # never hyperextended
-    pronation = (Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])) * R_WU.inv() * R_WF).as_rotvec()
-    assert np.abs(pronation[:, :2]).max() < 1e-9
-    assert 40 < np.rad2deg(np.abs(pronation[:, 2])).max() < 60
-
-
 def test_rests_and_start_are_exactly_still(perfect: Simulation) -> None:
     still = within(perfect, "start", "rest")
     assert len(perfect.phases["rest"]) == 7

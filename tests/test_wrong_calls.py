@@ -245,12 +245,6 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
             wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
 
 
-def test_the_name_that_is_meant_may_differ_in_case_and_hyphens() -> None:
-    recording = replace(right()["track"]["recording"], start_pose="N-Pose")
-    with pytest.raises(wp.WeposeError, match="did you mean 'n_pose'"):
-        wp.track(recording)
-
-
 def test_a_pose_or_a_truth_of_nan_is_refused() -> None:
     pose = right()["evaluate"]["pose"]
     quats, points = ({n: np.full_like(v, NAN) for n, v in each.items()} for each in (pose.quat_WL, pose.points))

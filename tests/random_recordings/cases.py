@@ -130,23 +130,9 @@ def draw_case(seed: int, seconds: float | None = None, ordinary: bool = False) -
     bending = frozenset(side for side in SIDES if f"{side}_hand" in sensors)
     motion = Motion(person, activities, begins, joins, sway, draw_stance(stream(seed, "stance")), bending)
     worn, mounts = _worn(stream(seed, "sensors"), sensors, person, calibrates)
-    case = Case(
-        seed,
-        person,
-        motion,
-        worn,
-        clock,
-        _layout(stream(seed, "files")),
-        duration,
-        spans["start"],
-        spans["start"],
-        spans.get("clasp"),
-        in_motion,
-        "amekf",
-        set(),
-        [],
-        {},
-    )
+    stated, layout = spans["start"], _layout(stream(seed, "files"))
+    about = (duration, stated, stated, spans.get("clasp"), in_motion)
+    case = Case(seed, person, motion, worn, clock, layout, *about, "amekf", set(), [], {})
     case.about += [
         f"{person.sex}, {person.stature:.2f} m, sways {size / DEG:.1f} deg/s",
         f"{len(worn)} sensors ({mounts}): {', '.join(worn)}",
