@@ -101,10 +101,7 @@ def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name:
 
 
 def estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
-    """The rotation [rad] about z from the near sensor's world to the far one's, and its standard deviation.
-
-    `near`, `far` : (n, 3, 4) of `compute_joint_sides`
-    """
+    """The rotation [rad] about z from the near sensor's world to the far one's, by their sides, and its std."""
     starts = np.linspace(0.0, 2.0 * np.pi, STARTS, endpoint=False)
     costs = np.array([np.sum(_fit_levers(near, far, angle)[0] ** 2) for angle in starts])
     heading = float(starts[int(np.argmin(costs))])

@@ -27,7 +27,7 @@ are zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi as ca
@@ -84,18 +84,9 @@ class Layout:
     attitude_std: tuple[float, ...] = ()  # [rad] of each orientation about an axis across its segment; ratios matter
     soft: tuple[str, ...] = ()  # sensors on a foam
 
-    # The places of each unknown in x, and their number.
-    length: np.ndarray = field(init=False, compare=False)
-    heading: np.ndarray = field(init=False, compare=False)
-    tilt: np.ndarray = field(init=False, compare=False)
-    drift: np.ndarray = field(init=False, compare=False)
-    hinge: np.ndarray = field(init=False, compare=False)
-    foam: np.ndarray = field(init=False, compare=False)
-    twist: np.ndarray = field(init=False, compare=False)
-    girdle: np.ndarray = field(init=False, compare=False)
-    point: np.ndarray = field(init=False, compare=False)
-    height: np.ndarray = field(init=False, compare=False)
-    size: int = field(init=False, compare=False)
+    # The places of each unknown in x, and their number; set below.
+    length = heading = tilt = drift = hinge = foam = twist = girdle = point = height = np.empty(0, dtype=int)
+    size = 0
 
     def __post_init__(self) -> None:
         sensors, begin = len(self.sensors), 0
@@ -123,11 +114,6 @@ class Layout:
         return slice(4 * len(self.sensors), 4 * len(self.sensors) + 3 * self.recorded)
 
     @property
-    def rows(self) -> int:
-        """Number of values that a sample has."""
-        return self.place.stop + 1
-
-    @property
     def residuals(self) -> int:
         """Number of residuals of a sample."""
         return GAP_ROWS + len(self.hinges)
@@ -140,7 +126,7 @@ def sample_functions(layout: Layout, condition: Constraint) -> tuple[ca.Function
     The first gives its residuals (k,) and its gap (3,) [m], zero without a closure; the second the Jacobian of the
     residuals, transposed (m, k).
     """
-    x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.rows)
+    x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.place.stop + 1)
     quat_WL = _orient_segments(layout, x, data)
     r, gap, hinges = ca.SX.zeros(GAP_ROWS), ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
     if isinstance(condition, Loop):

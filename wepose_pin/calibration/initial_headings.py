@@ -36,15 +36,10 @@ _FIFTHS = 2.0 * np.pi / 5.0 * np.arange(5)
 def search_headings(
     observations: Observations, x: np.ndarray, stated: Mapping[str, float], couplings: Sequence[Coupling] = ()
 ) -> np.ndarray:
-    """Return distinct headings (k, sensors) [rad] with a minimum each, the lowest first.
+    """Return distinct headings ψ (k, sensors) [rad] with a minimum each, the lowest first.
 
-    ψ turns a sensor's world to W, in which the body's start pose is known.
-
-    Parameters
-    ----------
-    x : (m,) with the lengths, points and heights as known before
-    stated : sensor → ψ [rad] of its stated mount; the others may be anywhere
-    couplings : headings of neighbours relative to each other
+    Lengths, points and heights are those of x (m,); `stated` has the ψ of sensors with a stated mount, others may be
+    anywhere.
     """
     sensors = observations.layout.sensors
     is_known = np.array([name in stated for name in sensors])
@@ -74,7 +69,7 @@ def _collect_terms(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return c (n, 3) and F (sensors, 5, n, 3) in units of their standard deviations.
 
-    They are those of closures, at some of their samples, of poses and bows on average, and of couplings.
+    They are those of closures at some of their samples, of poses and bows on average, and of couplings.
     """
     layout, sensors = observations.layout, observations.layout.sensors
     constants, harmonics = [np.zeros((0, 3))], [np.zeros((len(sensors), 5, 0, 3))]
@@ -150,13 +145,9 @@ def _turn_about_z(v: np.ndarray) -> np.ndarray:
 def _descend(
     psi: np.ndarray, constant: np.ndarray, F: np.ndarray, center: np.ndarray, information: np.ndarray, rounds: int
 ) -> np.ndarray:
-    """Return headings (b, sensors) after some rounds of damped Gauss-Newton, the lowest cost first.
+    """Return headings (b, sensors) after some rounds of damped Gauss-Newton from ψ, the lowest cost first.
 
-    Parameters
-    ----------
-    psi : (b, sensors) to start from
-    constant, F : c (n, 3) and F (sensors, 5, n, 3)
-    center, information : (sensors,) of what is known of them
+    `center` and `information` (sensors,) are what is known of them before.
     """
     m, n = len(center), len(constant)
     F = F.reshape(m, 5, 3 * n)

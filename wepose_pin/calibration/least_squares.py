@@ -153,16 +153,7 @@ class LeastSquares:
 def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> LeastSquares:
     """Return the least squares at its minimum, by sequential quadratic programming with the Gauss-Newton Hessian.
 
-    Parameters
-    ----------
-    problem : at the x to begin with
-    steps : at most
-    strict : raise where the steps do not suffice, instead of returning the last x
-
-    Raises
-    ------
-    NoSolution
-        It did not converge.
+    It takes `steps` at most. Where they do not suffice it raises `NoSolution` if `strict`, else it returns the last x.
     """
     observations, (mean, information), weights = problem.observations, problem.prior, problem.weights
     start = np.maximum(problem.x, problem.lower_bounds)

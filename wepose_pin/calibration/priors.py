@@ -29,10 +29,7 @@ POINT_STD = 3.0  # [m] of an unknown point of W
 def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaussian:
     """Return all that is known before the motion, as one Gaussian over x; unknown headings are 0.
 
-    Raises
-    ------
-    BadSubject
-        The prior has no positive definite covariance of its lengths.
+    It raises `BadSubject` where the prior has no positive definite covariance of its lengths.
     """
     layout, table = observations.layout, problem.model.table
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))

@@ -72,10 +72,7 @@ class CalibrationProblem:
     def conditions(self) -> tuple[Constraint, ...]:
         """The protocol's conditions on the body with these sensors, in the protocol's order.
 
-        Raises
-        ------
-        BadSession
-            A closure between points that no sensor determines, or a pose of a segment without a sensor.
+        It raises `BadSession` for a closure between points that no sensor determines, or a pose without its sensor.
         """
         return resolve_conditions(self.protocol, self.model, self.start_pose, self.recording)
 
@@ -160,10 +157,7 @@ class CalibrationProblem:
         return replace(self, recording=recording, prior=prior)
 
     def leave_out_mounts(self, estimated: Mapping[str, np.ndarray] | None = None) -> CalibrationProblem:
-        """Return the same problem without the mounts that gravity contradicts in the start pose.
-
-        `estimated` : segment → `quat_LS` by the motion, which contradicts them instead
-        """
+        """Return the same problem without the mounts that gravity, or mounts `estimated` by the motion, contradict."""
         limit, unused = float(np.deg2rad(MAX_MOUNT_ERROR_DEG if estimated is None else MOUNT_WARNING_DEG)), []
         for name in self.recording.imus:
             mount = self.mount(name)
@@ -181,10 +175,7 @@ class CalibrationProblem:
         return replace(problem, unused_mounts=(*self.unused_mounts, *unused))
 
     def relabel(self, moved: Mapping[str, str]) -> CalibrationProblem:
-        """Return the same problem with sensors exchanged between segments; a stated mount goes with its sensor.
-
-        `moved` : segment → label of the sensor on it, where they differ
-        """
+        """Return the same problem with exchanged sensors, segment → label; a stated mount goes with its sensor."""
 
         def exchange(values: Mapping[str, Any]) -> dict[str, Any]:
             return {segment: values[moved.get(segment, segment)] for segment in values}
@@ -232,10 +223,7 @@ class CalibrationProblem:
     def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[Observations, np.ndarray]:
         """Return the observations of all conditions, and the numbers (n,) of their samples in the recording.
 
-        Raises
-        ------
-        BadPhase
-            A condition has too few samples at which all sensors measure, connected with the start pose.
+        It raises `BadPhase` where a condition has too few samples with all sensors, connected with the start pose.
         """
         recording, filtered, layout = self.recording, self.filtered, self._lay_out()
         (connected, lost, loss), conditions = self.connected, self.protocol.conditions

@@ -180,7 +180,7 @@ def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, me
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
     """Return the solution without the mounts that gravity or the motion contradicts, its labels checked."""
     problem = problem.leave_out_mounts()
-    problem.observe()  # raises where a phase is too short, before anything is estimated
+    problem.observe()  # raises where a phase is too short
     quick = exchange_labels(leave_out_mounts(solve_problem(problem, quick=True)))
     try:
         return quick if quick.exchanged else solve_problem(quick.problem)
@@ -236,9 +236,8 @@ def separate_mounts(earlier: Subject, population: Subject) -> Subject:
 def fuse_calibrations(earlier: Subject, subject: Subject, table: BodyTable) -> Subject:
     """Return the subject with lengths and girdles of an earlier calibration too; its mounts follow by correlation.
 
-    Most of a calibration's error comes again in the next one: soft tissue follows the joints, and the shoulders leave
-    the law in the same way. So each is solved on the population prior, and they are fused by covariance intersection,
-    which holds whatever their errors have in common (Julier and Uhlmann 1997).
+    Most of a calibration's error comes again in the next one. So each is solved on the population prior, and they are
+    fused by covariance intersection, which holds whatever their errors have in common (Julier and Uhlmann 1997).
     """
     shape_rows, still = (*table.lengths, *girdle_rows(table)), np.zeros(len(PARAMETERS))
     x, C = [], []

@@ -45,17 +45,12 @@ PoseStd = Annotated[float, Key("std_deg", "deg", 0.1, 45.0)]
 class Closure(NamedTuple):
     """Points that stay together, at a point of W, on a level plane, or where they were recorded.
 
-    Parameters
-    ----------
-    phase : of the session in which it holds
-    kind : one of `KINDS`
-    points : of the body
-    slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
-    at, at_std : (3,) [m] the fixed point in W, and its standard deviation, where it is known
-    origin : the point from which a recorded place or the fixed point is counted; empty: the root
+    `slip` [m] is one standard deviation, each axis, of what holds only nearly; it sets the weights' shape, not size.
+    `at` (3,) [m] is a fixed point of W, where it is known. A recorded place or a fixed point is counted from `origin`;
+    empty: from the root.
     """
 
-    phase: str
+    phase: str  # of the session in which it holds
     kind: Annotated[str, Key(of="kinds")]
     points: tuple[str, ...]
     slip: Annotated[float, Key("slip", "m", 1e-4, 0.1)] = PALM_SLIP_STD
@@ -156,10 +151,7 @@ def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:
 def load_protocol(name: str | Path) -> Protocol:
     """A protocol by its name, from a TOML file of one's own, or several of them joined by "+".
 
-    Raises
-    ------
-    BadOption
-        There is no such protocol, or its file has a key or value that is none.
+    It raises `BadOption` where there is no such protocol, or its file has a key or value that is none.
     """
     names = split_protocol(name)
     if len(names) > 1:  # one after another; the start pose is held once

@@ -138,12 +138,15 @@ class Calibration:
     @property
     def rms_gap(self) -> float:
         """[m] root mean square of the gap's length, where the hands are joined; NaN without a closure."""
-        return float(np.sqrt(np.mean(self.gap[self.touching] ** 2))) if self.touching.any() else np.nan
+        return self._average(self.gap)
 
     @property
     def prior_rms_gap(self) -> float:
         """[m] the same with the prior's lengths."""
-        return float(np.sqrt(np.mean(self.prior_gap[self.touching] ** 2))) if self.touching.any() else np.nan
+        return self._average(self.prior_gap)
+
+    def _average(self, gap: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(gap[self.touching] ** 2))) if self.touching.any() else np.nan
 
     def __repr__(self) -> str:
         stds = [1e3 * std for name in self.subject.lengths if np.isfinite(std := self.subject.std(name))]

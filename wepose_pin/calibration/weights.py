@@ -58,11 +58,8 @@ def solve_reweighted(
     """Return the fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
 
     Poses beside a closure are used where they do not contradict it. What they are compared with is found without them.
-
-    Parameters
-    ----------
-    start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
-    quick : one round with few steps and without hinges
+    It begins with x `start` (m,), in which `contact` (n,) is the weight of each sample's gap. `quick`: one round with
+    few steps and without hinges.
     """
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
     contact, correlation = contact.copy(), min_correlation(observations)

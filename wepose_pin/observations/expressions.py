@@ -168,10 +168,7 @@ def find_path(
 ) -> PointPath:
     """Find the path of a signed sum of points, its vectors by segments in the order of the table.
 
-    Raises
-    ------
-    BadSession
-        A link on the path has no sensor, and is not rigid with one that has.
+    It raises `BadSession` where a link on the path has no sensor, and is not rigid with one that has.
     """
     lengths = len(model.lengths)
     sums: dict[str, tuple[np.ndarray, np.ndarray]] = {}

@@ -119,11 +119,8 @@ def make_heading_problem(
 ) -> HeadingProblem | None:
     """Return what observes the headings of these segments, and how well they are known at the start; None: nothing.
 
-    Parameters
-    ----------
-    recording : the first chunk, or the one that ends with the start pose
-    quat_LS : segment → (4,) xyzw, the mounts used
-    noises : of the sensors that have a filter
+    `recording` is the first chunk, or the one that ends with the start pose, `quat_LS` (4,) xyzw the mounts used, and
+    `noises` are those of sensors with a filter.
     """
     names, rate_hz = tuple(quat_LS), recording.rate_hz
     noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE

@@ -140,7 +140,9 @@ class HeadingCorrector:
         self.problem, self.offset, self._begin_s = problem, offset, begin
         self._quat_WV = rotations.rotation_about(E_Z, offset)
         self._filter = HeadingFilter(problem, start)
-        self._accelerations = JointAccelerationFilter(k, problem.sensor_rate_hz) if problem.pairs else None
+        # Of the joint accelerations: their band-pass, and the last two samples of the last knot.
+        self._band: BandPass | None = None
+        self._last_R_WS, self._last_accel_S = np.zeros((2, k, 3, 3)), np.zeros((2, k, 3))
         self._size = problem.stride * problem.samples_per_knot
         self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if problem.causal else 0
         self._quat_VS, self._accel_S = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
@@ -171,10 +173,7 @@ class HeadingCorrector:
     def push(self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray | bool) -> bool:
         """Add up to `remaining` samples; return whether the knot is complete.
 
-        Parameters
-        ----------
-        quat_VS, accel_S : (n, k, 4) xyzw, (n, k, 3) [m/s²], NaN where lost
-        clasped : (n,) bool: the palms are joined
+        `quat_VS` is (n, k, 4) xyzw, `accel_S` (n, k, 3) [m/s²], NaN where lost, `clasped` (n,) bool: joined palms.
         """
         rows = slice(self._count, self._count + len(quat_VS))
         self._quat_VS[rows], self._accel_S[rows], self._clasped[rows] = quat_VS, accel_S, clasped
@@ -206,9 +205,9 @@ class HeadingCorrector:
         problem, rows, k = self.problem, slice(None, None, self.problem.stride), len(self.offset)
         quat_WS = rotations.multiply(self._quat_WV, quat_VS)
         sides = np.zeros((0, k, 3, 8))
-        if self._accelerations is not None:
+        if problem.pairs:
             R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(-1, k, 3, 3)
-            sides = self._accelerations.push(R_WS, accel_S)[rows]
+            sides = self._filter_sides(R_WS, accel_S)[rows]
         lost = ~np.isfinite(accel_S).all(axis=(0, 2))
         quat_WL = rotations.multiply(quat_WS[rows], problem.quat_SL)
         yield
@@ -219,6 +218,24 @@ class HeadingCorrector:
         else:
             self._history.append((self._filter.x, self._filter.P, self._filter.process))
             self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / problem.sensor_rate_hz)
+
+    def _filter_sides(self, R_WS: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Return the side B (n, k, 3, 8) of each sensor at its joints, band-passed, one sample late.
+
+        `R_WS` is (n, k, 3, 3), `accel_S` (n, k, 3) [m/s²], NaN where lost; where samples are lost B is of no use.
+        """
+        rate_hz, accel_S = self.problem.sensor_rate_hz, np.concatenate([self._last_accel_S, accel_S])
+        lost = ~np.isfinite(accel_S).all(axis=2)
+        for i in np.flatnonzero(lost.any(axis=0)):
+            accel_S[:, i] = accel_S[np.maximum.accumulate(np.where(lost[:, i], 0, np.arange(len(accel_S)))), i]
+        if self._band is None:
+            self._last_R_WS, accel_S[:2] = np.repeat(R_WS[:1], 2, axis=0), accel_S[2]
+            steady = compute_sides(np.repeat(R_WS[:1], 3, axis=0), np.repeat(accel_S[2:3], 3, axis=0), rate_hz)
+            self._band = BandPass(BAND_HZ, rate_hz, steady.ravel())
+        R_WS = np.concatenate([self._last_R_WS, R_WS])
+        self._last_R_WS, self._last_accel_S = R_WS[-2:], accel_S[-2:]
+        B = compute_sides(R_WS, accel_S, rate_hz)
+        return self._band.push(B.reshape(len(B), -1)).reshape(B.shape)
 
     def _apply(self) -> None:
         """Finish the last knot; causally its correction fades in from the next sample on."""
@@ -303,30 +320,3 @@ def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
     """
     weighted = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
     return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
-
-
-class JointAccelerationFilter:
-    """The side B of each of k sensors at its joints, band-passed; it runs on from call to call."""
-
-    def __init__(self, sensors: int, rate_hz: float) -> None:
-        self._rate_hz = rate_hz
-        self._band: BandPass | None = None
-        self._last_R_WS, self._last_accel_S = np.zeros((2, sensors, 3, 3)), np.zeros((2, sensors, 3))
-
-    def push(self, R_WS: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Return B (n, k, 3, 8), one sample late; where a sensor has lost samples it is of no use.
-
-        `R_WS` is (n, k, 3, 3), `accel_S` (n, k, 3) [m/s²], NaN where lost.
-        """
-        accel_S = np.concatenate([self._last_accel_S, accel_S])
-        lost = ~np.isfinite(accel_S).all(axis=2)
-        for i in np.flatnonzero(lost.any(axis=0)):
-            accel_S[:, i] = accel_S[np.maximum.accumulate(np.where(lost[:, i], 0, np.arange(len(accel_S)))), i]
-        if self._band is None:
-            self._last_R_WS, accel_S[:2] = np.repeat(R_WS[:1], 2, axis=0), accel_S[2]
-            steady = compute_sides(np.repeat(R_WS[:1], 3, axis=0), np.repeat(accel_S[2:3], 3, axis=0), self._rate_hz)
-            self._band = BandPass(BAND_HZ, self._rate_hz, steady.ravel())
-        R_WS = np.concatenate([self._last_R_WS, R_WS])
-        self._last_R_WS, self._last_accel_S = R_WS[-2:], accel_S[-2:]
-        B = compute_sides(R_WS, accel_S, self._rate_hz)
-        return self._band.push(B.reshape(len(B), -1)).reshape(B.shape)

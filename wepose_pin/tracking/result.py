@@ -34,40 +34,19 @@ class TrackResult:
     It prints itself in one line, and a notebook shows its diagnostics too. `export`, `retarget`, `joint_angles` and
     `evaluate` take it as it is. `time` (n,) [s], `quat_WL` segment → (n, 4) xyzw, `points` point → (n, 3) [m] in W and
     `q` (n, nq) are the pose's; `pose` also has their covariances.
-
-    Parameters
-    ----------
-    name : str
-        Of the recording, as titles and files state it.
-    pose : Pose
-        In W, n samples.
-    model : BodyModel
-        The body with the subject's lengths.
-    subject : Subject
-        Lengths and mounts as used.
-    phases : mapping
-        Name → intervals [s] of the recording.
-    marks : tuple of Mark
-        Texts that were marked in a live session, with their times [s].
-    source : SegmentOrientations or Path
-        From `track` the recording and the intermediate results, also as `recording` and `segments`; from `load_result`
-        the folder; None: made in code.
-    correction : HeadingCorrection, optional
-        Of the headings so far; None where nothing can correct them.
-    summary : mapping
-        The content of ``summary.json``: inputs, options and results. It is empty of a chunk (`track_chunks`).
-    diagnostics : tuple of Diagnostic
-        What the user should know, each with a code, severity, place, value and limit. None of a chunk.
     """
 
-    name: str
-    pose: Pose
-    model: BodyModel
-    subject: Subject
-    phases: Mapping[str, Intervals] = field(default_factory=dict)
-    marks: tuple[Mark, ...] = ()
+    name: str  # of the recording, as titles and files state it
+    pose: Pose  # in W, n samples
+    model: BodyModel  # the body with the subject's lengths
+    subject: Subject  # lengths and mounts as used
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # name → intervals [s] of the recording
+    marks: tuple[Mark, ...] = ()  # texts that were marked in a live session, with their times [s]
+    # From `track` the recording and the intermediate results, also as `recording` and `segments`; from `load_result`
+    # the folder; None: made in code.
     source: SegmentOrientations | Path | None = None
-    correction: HeadingCorrection | None = None
+    correction: HeadingCorrection | None = None  # of the headings so far; None where nothing can correct them
+    # The content of ``summary.json``, and what the user should know; both empty of a chunk (`track_chunks`).
     summary: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: tuple[Diagnostic, ...] = ()
 
@@ -119,7 +98,6 @@ class TrackResult:
         return self.segments.options
 
     def check(self) -> TrackResult:
-        """Check the pose (`Pose.check`) and return the result."""
         self.pose.check()
         return self
 

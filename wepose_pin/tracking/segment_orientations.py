@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..body import BodyTable
-from ..body.mounts import MEASURED_ORIENTATION_STD, StartPose, compute_start_heading_var, find_mount_covariance
+from ..body.mounts import StartPose, compute_start_heading_var, find_mount_covariance
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..errors import BadOption
 from ..filters import BEST, OFFLINE, Orientation, check_method
-from ..filters.base import HOLD_S, LOST_RATE_STD
 from ..filters.noise import ACCEL_BIAS_STD
 from ..filters.static import StaticTest
 from ..recording import Recording
@@ -39,43 +38,20 @@ class TrackOptions:
 
 @dataclass(frozen=True, repr=False)
 class SegmentOrientations:
-    """Orientation of each measured segment of a recording, or of a chunk of one.
+    """Orientation of each measured segment of a recording, or of a chunk of one."""
 
-    Parameters
-    ----------
-    recording : the input, n samples; of a causal tracker the part after the start pose
-    options : how it was tracked
-    quat_WL : segment → (n, 4) xyzw
-    quat_LS : segment → (4,) xyzw, the mount used
-    heading_offset : segment → ψ [rad], heading of its sensor's world V in W
-    orientation : segment → result of its sensor's filter, in V; no entry for measured orientations
-    covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
-        covariance, the tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. No
-        entry for filters without a covariance (ncf, gdc)
-    start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
-    diagnostics : of the recording, its start pose and its mounts
-    """
-
-    recording: Recording
-    options: TrackOptions
-    quat_WL: Mapping[str, np.ndarray]
-    quat_LS: Mapping[str, np.ndarray]
-    heading_offset: Mapping[str, float]
-    orientation: Mapping[str, Orientation]
+    recording: Recording  # the input, n samples; of a causal tracker the part after the start pose
+    options: TrackOptions  # how it was tracked
+    quat_WL: Mapping[str, np.ndarray]  # segment → (n, 4) xyzw
+    quat_LS: Mapping[str, np.ndarray]  # segment → (4,) xyzw, the mount used
+    heading_offset: Mapping[str, float]  # segment → ψ [rad], heading of its sensor's world V in W
+    orientation: Mapping[str, Orientation]  # segment → result of its sensor's filter, in V; of IMUs alone
+    # Segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's covariance, the
+    # tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. None of ncf and gdc.
     covariance_W: Mapping[str, np.ndarray]
-    start: tuple[float, float]
-    static_phase: tuple[float, float]
-    diagnostics: tuple[Diagnostic, ...]
-
-    def __repr__(self) -> str:
-        return f"SegmentOrientations({self.recording!r}, {self.options.method})"
-
-
-def compute_measured_covariance(lost_s: np.ndarray) -> np.ndarray:
-    """Compute the covariance (n, 3, 3) [rad²] of measured orientations that have been lost for `lost_s` (n,) [s]."""
-    # By the motion that may have been missed, as that of the filters.
-    missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
-    return (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
+    start: tuple[float, float]  # [s] from which headings and mounts are
+    static_phase: tuple[float, float]  # [s] from which noise and bias are
+    diagnostics: tuple[Diagnostic, ...]  # of the recording, its start pose and its mounts
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..body import BodyModel
 from ..body.mounts import (
+    MEASURED_ORIENTATION_STD,
     N_POSE,
     StartPose,
     align_sensors,
@@ -26,9 +27,10 @@ from ..body.subject import Subject
 from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..filters import Orientation
+from ..filters.base import HOLD_S, LOST_RATE_STD
 from ..filters.phases import find_reference_phases
 from ..filters.sensors import SensorFilters, find_start_orientations
-from ..recording import ImuSensor, OrientationSensor, Recording, Sensor
+from ..recording import ImuSensor, Recording, Sensor
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
 from .heading_problem import CLASP, make_heading_problem
@@ -37,7 +39,6 @@ from .segment_orientations import (
     SegmentOrientations,
     TrackOptions,
     compute_heading_variance,
-    compute_measured_covariance,
     compute_segment_covariance,
     compute_soft_tissue_covariances,
     correct_covariance,
@@ -89,15 +90,9 @@ class SegmentEstimator:
     def push(self, chunk: Recording) -> SegmentOrientations:
         """Return the segment orientations of a chunk, bit-identical with as many steps.
 
-        Raises
-        ------
-        WeposeError
-            In the first chunk: no mount is known for a sensor, or gravity contradicts it; a start phase with too few
-            samples.
+        The first one raises `WeposeError` where a mount is not known or gravity contradicts it, or the start is short.
         """
-        if not self.names:
-            return self._begin(chunk)
-        return self._place(chunk, self._filters.push(chunk))
+        return self._place(chunk, self._filters.push(chunk)) if self.names else self._begin(chunk)
 
     def _begin(self, first: Recording) -> SegmentOrientations:
         """Filter and align the first chunk."""
@@ -249,11 +244,14 @@ class SegmentEstimator:
         self._filter_headings = _describe_headings(quat_VS, attitude_cov, about_vertical)
         self._end_s, self._clasped = float(chunk.time[-1]), bool(clasped[-1])
         by_name, covariances = {name: quat_WL[:, i] for i, name in enumerate(self.names)}, {}
-        soft, lost_s = compute_soft_tissue_covariances(self._start_pose.table, by_name), self._count_lost(chunk)
-        for i, name in enumerate(self.names):
-            cov = self._find_covariance(
-                i, (quat_VS[:, i], attitude_cov[:, i]), lost_s[:, i], offset[:, i], variance[:, :, i]
-            )
+        soft = compute_soft_tissue_covariances(self._start_pose.table, by_name)
+        samples = np.arange(n)
+        for i, (name, sensor) in enumerate(chunk.sensors.items()):
+            filtered, lost = (quat_VS[:, i], attitude_cov[:, i]), np.zeros(n, dtype=int)
+            if self._measured[i] and sensor.gap is not None:
+                lost = samples - np.maximum.accumulate(np.where(sensor.gap, -1 - self._lost[i], samples))
+            self._lost[i] = lost[-1]
+            cov = self._find_covariance(i, filtered, lost / self.rate_hz, offset[:, i], variance[:, :, i])
             if cov is not None:
                 covariances[name] = cov + soft[name]
         return SegmentOrientations(
@@ -268,15 +266,6 @@ class SegmentEstimator:
             static_phase=self._phases.static,
             diagnostics=self.diagnostics,
         )
-
-    def _count_lost(self, chunk: Recording) -> np.ndarray:
-        """Return for how long (n, k) [s] measured orientations have been lost at each sample."""
-        samples, lost = np.arange(len(chunk)), np.zeros((len(chunk), len(self.names)), dtype=int)
-        for i, sensor in enumerate(chunk.sensors.values()):
-            if isinstance(sensor, OrientationSensor) and sensor.gap is not None:
-                lost[:, i] = samples - np.maximum.accumulate(np.where(sensor.gap, -1 - self._lost[i], samples))
-        self._lost = lost[-1]
-        return lost / self.rate_hz
 
     def smooth_headings(self) -> HeadingCorrection | None:
         """Return the correction of the headings after the last chunk; None: nothing observes them."""
@@ -338,18 +327,15 @@ class SegmentEstimator:
     ) -> np.ndarray | None:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment in W, error on the left, without soft tissue.
 
-        None: its filter has none.
-
-        Parameters
-        ----------
-        filtered : `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its attitude
-        lost_s : (n,) [s] for how long a measured orientation has been lost
-        offset : (n,) [rad] ψ
-        variance : (n, 3) [rad²] `HeadingCorrector.variance`
+        None: its filter has none. `filtered` is `quat_VS` (n, 4) xyzw and the attitude's covariance (n, 3, 3) [rad²],
+        `lost_s` (n,) [s] since a measured orientation, `offset` (n,) [rad] ψ, and `variance` (n, 3) [rad²] that of
+        `HeadingCorrector`.
         """
         name, (quat_VS, attitude_cov) = self.names[i], filtered
         if self._measured[i]:
-            attitude_cov = compute_measured_covariance(lost_s)
+            # It grows by the motion that may have been missed, as that of the filters.
+            missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
+            attitude_cov = (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
         if np.isnan(attitude_cov[0, 0, 0]):
             return None
         if self._first.sensors[name].aligned:

@@ -73,10 +73,7 @@ class Tracker:
     def push(self, chunk: Recording) -> TrackResult | None:
         """Add the next chunk; return it with its pose; None: `smooth` returns it, or the start pose has not ended.
 
-        Raises
-        ------
-        WeposeError
-            The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
+        It raises `WeposeError` where the recording, the subject or the model lacks something that is needed.
         """
         options, is_first, self._where = self.options, self.segment_estimator is None, f"{chunk.where()}: "
         self._fitted = self._fitted or _fit_body(self._subject, self._model, chunk)
@@ -107,10 +104,7 @@ class Tracker:
     def smooth(self) -> Iterator[TrackResult]:
         """Iterate over the chunks that `push` did not return, after the last one has been pushed.
 
-        Raises
-        ------
-        BadPhase
-            A causal tracker was given no start pose, or nothing after it.
+        It raises `BadPhase` where a causal tracker was given no start pose, or nothing after it.
         """
         if self.options.causal and self._kinematics is None:
             if self._chunks and not self._chunks[0].phases.get("start"):
@@ -159,12 +153,8 @@ def track_chunks(
 ) -> Iterator[TrackResult]:
     """Iterate over a recording's chunks with their poses: results of a day that are too long for memory.
 
-    The smoother's is one chunk. Parameters and errors as of `Tracker`.
-
-    Parameters
-    ----------
-    chunk_s : [s] of the chunks; the first one is as much longer as the phases `start` and `static` need
-    progress : is called with the share that is done, chunk by chunk
+    The smoother's is one chunk. Parameters and errors are those of `Tracker`. Chunks last `chunk_s` [s], the first one
+    as much longer as the phases `start` and `static` need; `progress` is called with the share that is done.
     """
     options = options or TrackOptions()
     tracker = Tracker(subject, model=model, options=options)
