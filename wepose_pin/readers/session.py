@@ -14,15 +14,7 @@ from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable
 from ..errors import BadData, BadSession, MissingFile, one_of
-from ..recording import (
-    ImuSensor,
-    OrientationSensor,
-    Recording,
-    Sensor,
-    check_phases,
-    check_recording,
-    format_span,
-)
+from ..recording import ImuSensor, OrientationSensor, Recording, Sensor, check_phases, check_recording, format_span
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
 from ..recording.faults import Fault, check_sensors
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples, resample

@@ -32,12 +32,8 @@ _RENAMED_PHASES = {
 OF_FORMATS = ("format", "label", "use")
 OF_COLUMNS = ("gyro_unit", "accel_unit", "time", "time_unit")
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
-_CHOICES: dict[str, Collection[str]] = {
-    "use": NEEDED,
-    "time_unit": TIME_UNITS,
-    "gyro_unit": GYRO_UNITS,
-    "accel_unit": ACCEL_UNITS,
-}
+_UNITS = {"time_unit": TIME_UNITS, "gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}
+_CHOICES: dict[str, Collection[str]] = {"use": NEEDED, **_UNITS}
 
 
 class SensorKeys(NamedTuple):

@@ -33,11 +33,10 @@ def write_c3d(path: Path, motion: Motion) -> None:
         raise BadData(f"{motion.where}: {n} samples; a .c3d holds {MOST_FRAMES}: --rate-hz {rate_hz:g}, or a .trc")
     p_W = np.stack([p.T for p in points.values()], axis=1)  # (3, points, n)
     file = ezc3d.c3d()
-    parameters = file["parameters"]["POINT"]
-    parameters["UNITS"]["value"] = ["mm"]
-    parameters["RATE"]["value"] = [motion.rate_hz]
-    parameters["LABELS"]["value"] = list(points)
-    parameters["DESCRIPTIONS"]["value"] = [f"{point.replace('_', ' ')} of {motion.name}"[:127] for point in points]
+    texts = [f"{point.replace('_', ' ')} of {motion.name}"[:127] for point in points]
+    about = {"UNITS": ["mm"], "RATE": [motion.rate_hz], "LABELS": list(points), "DESCRIPTIONS": texts}
+    for key, value in about.items():
+        file["parameters"]["POINT"][key]["value"] = value
     file.add_parameter("POINT", "X_SCREEN", ["+X"])
     file.add_parameter("POINT", "Y_SCREEN", ["+Z"])
     file["data"]["points"] = np.concatenate([1e3 * p_W, np.ones((1, *p_W.shape[1:]))])

@@ -178,16 +178,9 @@ def load_result(folder: str | Path) -> TrackResult:
     with library_errors(folder / "summary.json", "the summary of a result"):
         diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
         marks = tuple(Mark(float(time), str(text)) for time, text in summary.get("recorded_marks", ()))
+    name, phases = str(summary.get("recording") or folder.name), read_phases(summary)
     return TrackResult(
-        str(summary.get("recording") or folder.name),
-        pose,
-        model,
-        load_subject(folder),
-        read_phases(summary),
-        marks,
-        source=folder,
-        summary=summary,
-        diagnostics=diagnostics,
+        name, pose, model, load_subject(folder), phases, marks, source=folder, summary=summary, diagnostics=diagnostics
     )
 
 
