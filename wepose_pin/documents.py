@@ -262,7 +262,9 @@ def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Colle
         value = [value]  # one name in place of a list
     check_value(table.at(key.name), value, hint, table.error)
     for text in value if isinstance(value, list) else [value]:
-        if text == "" or (names and text not in names):
+        if text == "":
+            raise table.error(f"{table.at(key.name)} is empty; write a text, or leave it out")
+        if names and text not in names:
             raise table.error(f"{table.at(key.name)} = '{text}' is not known; {one_of(names, text)}")
     return key.words[str(value)] if key.words else _convert(value, key)
 
