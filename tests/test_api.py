@@ -23,10 +23,10 @@ from arms import write_arm
 
 import wepose_pin as wp
 from docs.diagnostics_page import list_examples
+from wepose_pin import Simulation
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
 from wepose_pin.recording import find_mount_axes
-from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -98,11 +98,7 @@ SAYS = [
     ("[phases]", "[phases", "session.toml: not valid TOML: Expected"),
     ("arm.csv", "x", "x: '' is not a known format; there is: .csv"),
     ("\n[data]", "\nnme = 'x'\n[data]", "session.toml: nme is not a known"),
-    (
-        "start = [[0.5, 2.5]]",
-        "still = [[0.5, 2.5]]",
-        "session.toml: phases.still is called static now: write static = [[from, to]]",
-    ),
+    ("start = [[0.5, 2.5]]", "still = [[0.5, 2.5]]", "phases.still is called static now: write static = [[from, to]]"),
     ("gyro_unit", "gyr_unit", "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?"),
     ('gyro_unit = "rad/s"\n', "", "session.toml: data.gyro_unit is missing; there is: rad/s, deg/s"),
     ('"m/s^2"', '"m/s2"', "data.accel_unit = 'm/s2' is not known; did you mean 'm/s^2'?"),
@@ -110,11 +106,7 @@ SAYS = [
     ("[data]", "[sensors.head]", "session.toml: data is missing; a table [data]"),
     ('file = "arm.csv"\n', "", "session.toml: data.file is missing"),
     ('accel = ["ax", "ay", "az"]\n', "", "sensors.torso.accel is missing"),
-    (
-        '["gx", "gy", "gz"]',
-        '["gx", "gy"]',
-        "sensors.torso.gyro = ['gx', 'gy']; a list of 3 different column names is needed",
-    ),
+    ('["gx", "gy", "gz"]', '["gx", "gy"]', "gyro = ['gx', 'gy']; a list of 3 different column names is needed"),
     ('time = "time"', "rate_hz = -100.0", "data.rate_hz = -100.0; a number from"),
     ('time = "time"', 'time = "time"\nrate_hz = 100', "one of the two, and both is"),
     ('time = "time"\n', "", "one of the two, and neither is there"),
@@ -123,17 +115,9 @@ SAYS = [
         'time = "time"\noffset_s = -2e12',
         "data.offset_s = -2000000000000.0; a number from -1e+12 to 1e+12 is needed",
     ),
-    (
-        "accel =",
-        "format = 'dot'\naccel =",
-        "sensors.torso.format has no effect, as the columns are named here; remove it",
-    ),
+    ("accel =", "format = 'dot'\naccel =", "format has no effect, as the columns are named here; remove it"),
     ('forward = "+x"', 'forward = "-z"', "mount.forward = '-z' is parallel to up = '+z'"),
-    (
-        "accel =",
-        'orientation = ["qx", "qy", "qz", "qw"]\naccel =',
-        "sensors.torso.orientation stands beside gyro; a sensor has one",
-    ),
+    ("accel =", 'orientation = ["qx", "qy", "qz", "qw"]\naccel =', "orientation stands beside gyro; a sensor has one"),
     ("\n[data]", "\nstart_pose = 'npose'\n[data]", "start_pose = 'npose' is not known; did you mean 'n_pose'?"),
     ('file = "arm.csv"', 'file = "arm.csv"\ntruth = "t.parquet"', "session.toml: data.truth: no such file 't.parquet'"),
     (
@@ -158,12 +142,7 @@ SAYS = [
 ]
 # Column, rows, the value put there, and what is said.
 PUTS = [
-    (
-        "gy",
-        slice(40, 41),
-        "0,125",
-        "arm.csv: column 'gy' holds text in row 41: '0,125'; write decimals with a point: 0.125",
-    ),
+    ("gy", slice(40, 41), "0,125", "column 'gy' holds text in row 41: '0,125'; write decimals with a point: 0.125"),
     ("ax", slice(6, 7), "n.v.", "arm.csv: column 'ax' holds text in row 7: 'n.v.'; it must be a number"),
     ("az", slice(70, 71), float("inf"), "arm.csv: column 'az' holds inf in row 71; it must be a number"),
     ("gx", slice(None), None, "sensors.torso.gyro: no numbers from 0 to"),
@@ -175,22 +154,13 @@ PUTS = [
     ),
     ("time", slice(100, 101), 0.5, "arm.csv: time goes back in row 101: 0.5 s"),
     ("time", slice(3, 4), None, "arm.csv: time: not a finite number in row 4"),
-    (
-        "gy",
-        slice(400, 406),
-        None,
-        "arm.csv: sensors.torso.gyro: samples are missing for 0.060 s from 4.000 s, after row 400; up to 50 ms",
-    ),
+    ("gy", slice(400, 406), None, "gyro: samples are missing for 0.060 s from 4.000 s, after row 400; up to 50 ms"),
     ("gz", slice(50, 51), -9999.0, "sensors.torso.gyro: -9999 rad/s on z at 0.500 s, no sensor measures above 80"),
     ("ax", slice(700, 701), 2**63, "sensors.torso.accel: 9.22337e+18 m/s^2 on x at 7."),
 ]
 # Columns, the factor on them, and what is said.
 SCALES = [
-    (
-        "time",
-        1000.0,
-        'arm.csv: time grows by 10 s from row to row, slower than any body sensor; time_unit = "ms" would fit',
-    ),
+    ("time", 1000.0, 'time grows by 10 s from row to row, slower than any body sensor; time_unit = "ms" would fit'),
     (
         "ax ay az",
         1 / 9.81,
@@ -264,6 +234,7 @@ def test_bad_input_is_told_in_one_line(
     spoil(files)
     line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
     assert message in line
+    assert str(files.folder) in line  # the file is named
     assert not (tmp_path / "out").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 

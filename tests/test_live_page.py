@@ -23,10 +23,10 @@ from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 import wepose_pin as wp
+from wepose_pin import Simulation
 from wepose_pin.live import LivePose, Request, SensorStatus, Status, StreamInfo
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.state import Action
-from wepose_pin.simulation import Simulation
 
 NARROW = "document.documentElement.scrollWidth <= innerWidth"
 

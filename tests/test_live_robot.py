@@ -28,10 +28,9 @@ from scipy.spatial.transform import Rotation
 from test_causal import first
 
 import wepose_pin as wp
-from wepose_pin import retargeting
+from wepose_pin import Simulation, retargeting
 from wepose_pin.live import LivePose, StreamInfo
 from wepose_pin.live.robot import RobotOutput
-from wepose_pin.simulation import Simulation
 from wepose_pin.writers import write_session
 
 pytest.importorskip("daqp")

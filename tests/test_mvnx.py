@@ -15,8 +15,7 @@ from device_files import MVN_SEGMENTS, mvnx, turning
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin import BadData, BadSession, MissingFile
-from wepose_pin.tracking import track
+from wepose_pin import BadData, BadSession, MissingFile, track
 from wepose_pin.writers import write_session
 
 OURS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")

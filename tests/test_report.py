@@ -12,7 +12,7 @@ from commands import run
 from reading import captions, headings, is_self_contained, rows, text_of, without_frame
 
 import wepose_pin as wp
-from wepose_pin.simulation import MILD_PRESET, simulate_person
+from wepose_pin import MILD_PRESET, simulate_person
 from wepose_pin.writers import write_session
 
 SECTIONS = ["Lengths", "Sensors", "Palm to palm over time", "The motion in 3D", "What was run"]

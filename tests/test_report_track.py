@@ -16,8 +16,8 @@ from reading import BROWSER, browse, captions, headings, is_self_contained, rows
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
+from wepose_pin import Simulation
 from wepose_pin.report.track import render_track_report
-from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import summarize
 from wepose_pin.writers import write_session
 

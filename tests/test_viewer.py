@@ -18,7 +18,7 @@ from PIL import Image
 from reading import BROWSER, browse
 
 import wepose_pin as wp
-from wepose_pin.simulation import Simulation
+from wepose_pin import Simulation
 
 NASTY = "</script><script>alert(1)</script>@@data@@ <b>&"
 

@@ -12,8 +12,7 @@ from device_files import ACCEL, GYRO, TIME, N
 from test_info import info
 
 import wepose_pin as wp
-from wepose_pin.errors import BadData
-from wepose_pin.recording import Recording
+from wepose_pin import BadData, Recording
 
 G = 9.80665
 EPOCH = 1_700_000_000

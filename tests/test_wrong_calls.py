@@ -15,9 +15,8 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
-from wepose_pin.errors import WeposeError
+from wepose_pin import Imperfections, ImuNoise, WeposeError
 from wepose_pin.filters import AmekfParams
-from wepose_pin.simulation import Imperfections, ImuNoise
 
 NAN, INF = float("nan"), float("inf")
 POSITIVE = ("100", NAN, INF, True, -1.0, 0.0)  # wrong for a number above 0
