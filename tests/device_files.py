@@ -155,18 +155,20 @@ def mat(path: Path) -> Path:
     return path
 
 
-def shimmer(path: Path, separator: str = ";", scale: float = 1.0) -> Path:
-    names = ["Timestamp_Unix"]
+def shimmer(path: Path, separator: str = ";", scale: float = 1.0, dates: bool = False) -> Path:
+    names = ["TimestampSync_FormattedUnix" if dates else "Timestamp_Unix"]
     names += [f"Accel_{kind}_{a}" for kind in ("LN", "WR") for a in AXES] + ["Battery"]
     names += [f"{kind}_{a}" for kind in ("Gyro", "Mag") for a in AXES]
     units = [
-        "ms",
+        "yyyy/mm/dd hh:mm:ss.000" if dates else "ms",
         *["m/(s^2)"] * 6,
         "mV",
         *["deg/s"] * 3,
         *["local_flux"] * 3,
     ]
     stamps = [f"{1e-3 * US0 + 10 * k:.1f}" for k in range(N)]
+    if dates:
+        stamps = [f"2026/03/12 08:00:{0.01 * k:06.3f}" for k in range(N)]
     noise = own(ACCEL, path)
     columns = [stamps, *(scale * noise).T, *(noise + 0.1).T, np.full(N, 4100.0), *np.degrees(GYRO).T, *ACCEL.T]
     head = f'"sep={separator}"\n' + separator.join([*(f"Shimmer_8665_{n}_CAL" for n in names), ""]) + "\n"

@@ -93,6 +93,7 @@ FILES: list[tuple[Callable[[Path], Path], str, str, tuple[str, ...]]] = [
     (df.sto, "trial_orientations.sto", "orientation", ("torso", "right_upper_arm")),
     (df.shimmer, "left_wrist.csv", "raw", ("left_forearm",)),
     (lambda p: df.shimmer(p, "\t"), "left_wrist.csv", "raw", ("left_forearm",)),
+    (lambda p: df.shimmer(p, ",", dates=True), "left_wrist.csv", "raw", ("left_forearm",)),
     (df.noraxon, "a.csv", "raw", ("torso", "right_forearm")),
     (lambda p: df.noraxon(p, "{} Accel Sensor {} (mG)"), "a.csv", "raw", ("torso", "right_forearm")),
     (df.delsys, "a.csv", "raw", ARM),

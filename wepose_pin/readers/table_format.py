@@ -77,6 +77,7 @@ class ClockColumn(NamedTuple):
     unit_s: Annotated[float, Key(name="unit_s")] = 1.0  # [s]
     wraps: Annotated[float | None, Key(most=1e12)] = None  # value at which it begins again at 0
     rate: str = ""  # pattern of the line before the table with the rate of which the column counts the samples
+    date: str = ""  # how it is written where it is no number
     spread: bool = False  # equal times are those of a packet
 
 
@@ -407,7 +408,13 @@ def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float
                 return table.times.setdefault(column, packets / (max(1.0, float(np.median(np.diff(packets)))) * rate))
         elif not rate_hz:
             if column not in table.times:
-                time = clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
+                cells = table.cells[str(column)]
+                if clock.date and cells.dtype == pl.String:
+                    cells = cells.str.to_datetime(clock.date, time_unit="us", strict=False)
+                if cells.dtype.is_temporal() and cells.count():
+                    time = 1e-6 * cells.cast(pl.Int64).cast(pl.Float64).fill_null(np.nan).to_numpy()
+                else:
+                    time = clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
                 table.times[column] = spread_equal_times(time) if clock.spread else time
             return table.times[column]
     if rate_hz:
