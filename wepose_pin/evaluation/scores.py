@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
 
@@ -211,7 +211,15 @@ def _resample(truth: Pose, time: np.ndarray) -> Pose:
 
 def _joint_errors(pose: Pose, truth: Pose, segments: list[str]) -> dict[str, dict[str, AngleError]]:
     """Joint → angle → its error, of joints between these segments."""
-    poses = [replace(each, quat_WL={name: each.quat_WL[name] for name in segments}) for each in (pose, truth)]
+    poses = [
+        Pose(
+            each.time,
+            {name: each.quat_WL[name] for name in segments},
+            {},
+            gap={name: each.gap[name] for name in segments if name in each.gap},
+        )
+        for each in (pose, truth)
+    ]
     try:
         angles, true = map(joint_angles, poses)
     except BadData:  # no joint has both of its segments

@@ -106,7 +106,7 @@ class Simulation:
 
         Without `Imperfections.girdle` they do not move; what a person has beside de Groot's regression is not in it.
         """
-        own = (1.0 - min(self.imperfections.girdle, 1.0)) * FIXED
+        own = (1.0 - min(self.imperfections.girdle, 1.0)) * FIXED + 0.0  # no -0.0 in a file
         return dict.fromkeys(load_table().girdles, own)
 
     def truth(self) -> Pose:
