@@ -177,6 +177,34 @@ def test_a_dead_gyroscope_of_a_torso_that_turns_with_the_arms_is_refused(tmp_pat
         load_session(path)
 
 
+def test_coarse_digits_and_zeros_at_rest_are_no_fault(tmp_path: Path) -> None:
+    """Force in steps of ten times its noise, in poses that are held, and gyroscopes with a dead zone on a table."""
+    rng, time = np.random.default_rng(0), np.arange(6000) / 50.0
+    phase, held = np.minimum(1.0, time % 5.0 / 3.0), (time // 5.0).astype(int)
+    poses = np.repeat(rng.uniform(-1.0, 1.0, (13, 3)), 2, axis=0)[:25]
+    angle = poses[held] + (phase**2 * (3.0 - 2.0 * phase))[:, None] * (poses[held + 1] - poses[held])
+    R = Rotation.from_rotvec(angle)
+    gyro_S = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * 50.0])
+    gyro_S, force = gyro_S + rng.normal(0.0, 0.003, (6000, 3)), R.inv().apply([0.0, 0.0, 9.81])
+    coarse = ImuSensor(gyro_S, np.round(10.0 * (force + rng.normal(0.0, 0.01, (6000, 3)))) / 10.0)
+    lying = ImuSensor(np.zeros((6000, 3)), [0.0, 0.0, 9.81] + rng.normal(0.0, 0.05, (6000, 3)))
+    for name, sensor in (("coarse", coarse), ("lying", lying)):
+        read = load_session(written(tmp_path / name, Recording(name, time, 50.0, {"torso": sensor})))
+        assert "sensor-frozen" not in {each.code for each in read.diagnostics}
+
+
+def test_a_start_pose_that_turns_from_its_first_sample_on_is_refused() -> None:
+    rng, time = np.random.default_rng(0), np.arange(2000) / RATE
+    rate = np.where(time % 2.0 < 1.0, 0.2, -0.2)
+    angle = np.cumsum(rate) / RATE
+    gyro_S = np.stack([0.0 * rate, rate, 0.0 * rate], axis=1) + rng.normal(0.0, 0.002, (2000, 3))
+    accel_S = 9.81 * np.stack([-np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1) + rng.normal(0.0, 0.02, (2000, 3))
+    phases, mounts = {"start": [(0.0, 4.0)]}, {"torso": ("+z", "+x")}
+    recording = Recording.from_arrays(RATE, torso=(gyro_S, accel_S), phases=phases, mounts=mounts)
+    with pytest.raises(WeposeError, match="less than 1 s of it is static"):
+        track(recording, open_loop=True)
+
+
 # Arrays ------------------------------------------------------------------------------------------------------------
 
 

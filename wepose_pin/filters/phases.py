@@ -142,7 +142,7 @@ def _find_static_part(
     begin, end = max(find_runs(~moves), key=lambda run: run[1] - run[0], default=(0, 0))
     rows = span.start + np.append(blocks, size)
     static = (float(recording.time[rows[begin]]), float(recording.time[rows[end] - 1]))
-    if static[1] - static[0] < LEAST_STATIC_S:
+    if begin == end or static[1] - static[0] < LEAST_STATIC_S:
         raise BadPhase(
             f"{recording.where()}: phases.{phase}: sensors.{fastest} turns at up to {rate_deg_s:.0f} deg/s in "
             f"{format_span(interval)}, and less than {LEAST_STATIC_S:g} s of it is static; name seconds in which "

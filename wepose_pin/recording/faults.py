@@ -24,8 +24,10 @@ from .limits import NARROWEST_GYRO_RANGE
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5
 STUCK_S = 1.0  # [s] the same for rate or force alone
 MOST_REPEATS = 4.0  # times as long as it repeats otherwise
+COARSE = 1e-4  # share of runs of equal rows above so many times the usual length from which the digits are coarse
 # Noise reverses dozens of times a second; smooth motion hardly does.
 NOISY_HZ, NOISY_S = 10.0, 2  # [1/s] mean over the signals, and seconds of it
+MOVING = 0.5  # [m/s²] standard deviation of an axis of accel of a sensor that moves
 ROUNDING_TURN = 1e-14  # product of two steps [SI] that are rounding
 
 # An axis is saturated where it stands at its extreme for `PLATEAU` samples in a row, or `MANY` times for at least
@@ -151,16 +153,21 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             if not long.any():
                 continue
-            noisy = all(_is_noisy(time, values) for values in columns)
+            runs = np.diff(np.flatnonzero(~repeats), append=len(time))  # with those of one row
+            longer = np.count_nonzero(runs > MOST_REPEATS * np.median(runs))
+            coarse = longer > 3 * np.count_nonzero(long) + COARSE * len(runs)
+            noisy = not coarse and all(_is_noisy(time, values) for values in columns)
             rare = length > MOST_REPEATS * length[~long].max(initial=1)
             for a, b in zip(first[long & rare].tolist(), last[long & rare].tolist(), strict=True):
                 if covered[a : b + 1].all():
                     continue
-                is_stuck = noisy
-                if signals == GYRO and not gyro_S[a].any():  # a firmware with a dead zone reports zero at any rest
-                    is_stuck &= np.count_nonzero(~gyro_S.any(axis=1)) < b + 1 - a + FROZEN_SAMPLES
+                is_stuck, is_zero = noisy, signals == GYRO and not gyro_S[a].any()
                 if b - a == len(time) - 1:
                     is_stuck = any(_is_noisy(each[0], values) for each in samples.values() for values in each[1:])
+                if is_zero:  # a firmware with a dead zone reports zero at any rest
+                    is_moved = any(gyro.any() for _, gyro, _ in samples.values()) or accel_S.std(axis=0).max() > MOVING
+                    others = np.count_nonzero(of_gyro & ~gyro_S.any(axis=1)) - (b - a)
+                    is_stuck &= is_moved and others < FROZEN_SAMPLES
                 if is_stuck:
                     covered[a : b + 1] = True
                     # At the beginning of the recording the first sample is faulty, too.
