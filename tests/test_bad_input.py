@@ -115,6 +115,7 @@ SAYS = [
         'time = "time"\noffset_s = -2e12',
         "data.offset_s = -2000000000000.0; a number from -1e+12 to 1e+12 is needed",
     ),
+    ("\ntime =", "\nuse = 'raw'\ntime =", "data.use has no effect, as the columns are named here; remove it"),
     ("accel =", "format = 'dot'\naccel =", "format has no effect, as the columns are named here; remove it"),
     ('forward = "+x"', 'forward = "-z"', "mount.forward = '-z' is parallel to up = '+z'"),
     ("accel =", 'orientation = ["qx", "qy", "qz", "qw"]\naccel =', "orientation stands beside gyro; a sensor has one"),

@@ -255,6 +255,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
             "is a robot's trajectory, for lerobot",
         ),
         (["-o", "x.bin", "--format", "mcap"], "name it x.mcap"),
+        (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
         (["-o", "d"], "-o d: '' is no format's suffix"),
         (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
         (["{slow}", "-o", "d", "--format", "lerobot"], "robot arm, 25 Hz, joints"),

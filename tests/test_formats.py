@@ -551,6 +551,7 @@ def test_a_description_that_is_wrong_is_one_line(change: tuple[str, str], says: 
     ("keys", "says"),
     [
         ('format = "lab.toml"\n[sensors.torso]\ngyro_unit = "deg/s"', r"gyro_unit has no effect, as the format of the"),
+        ('format = "lab.toml"\ntime = "t"', r"data\.time has no effect, as the format of the file defines it"),
         ('format = "dott"', "did you mean 'dot'"),
         ('format = "mine.toml"', r"mine\.toml: no such file"),
     ],

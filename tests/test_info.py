@@ -90,7 +90,9 @@ def test_a_rate_is_proposed_for_files_without_one(capsys: pytest.CaptureFixture[
     assert recording.rate_hz == pytest.approx(100.0, rel=0.01)
 
 
-def test_an_ximu3_folder_and_what_to_check(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_an_ximu3_folder_and_what_to_check(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ximu3(tmp_path / "x-IMU3 12AB34CD (UDP)")
     text = info(capsys, tmp_path / "x-IMU3 12AB34CD (UDP)")
     assert "400 samples at 100 Hz" in text  # it was read, though nobody knows where it was worn
@@ -100,6 +102,9 @@ def test_an_ximu3_folder_and_what_to_check(capsys: pytest.CaptureFixture[str], t
     session = tmp_path / "session.toml"
     session.write_text(session.read_text().replace("# [sensors.SEGMENT]\n# file", "[sensors.left_forearm]\nfile"))
     np.testing.assert_allclose(wp.load_session(session).sensors["left_forearm"].gyro_S, GYRO, atol=1e-6)
+    ximu3(tmp_path / "torso")
+    monkeypatch.chdir(tmp_path / "torso")
+    assert "2 files" in info(capsys, Path())
 
 
 def test_a_session_elsewhere_names_the_data_from_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

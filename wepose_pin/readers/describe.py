@@ -67,7 +67,7 @@ def find_file(path: Path, body: BodyTable | None = None) -> Path:
         return path
     named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
     if named is not None or detect_format(path) is not None:
-        return named or path
+        return named or (path if path.name else path.absolute())  # beside "." nothing is found
     files = [file for file in sorted(path.iterdir()) if file.is_file()]
     data = [file for file in files if file.suffix.lower() in TABLES or is_array_file(file) or detect_format(file)]
     if not data:

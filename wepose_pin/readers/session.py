@@ -65,11 +65,12 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     head = read_head(top)
     devices = {name: files.open_device(tables[name], each) for name, each in keys.items() if not each.signals}
     measured: dict[str, _Measured] = {}
+    alike = len({bool(each.signals) for each in keys.values()}) == 1
     for name, each in keys.items():
-        table = tables[name]
-        if unused := next((key for key in (OF_FORMATS if each.signals else OF_COLUMNS) if key in table), None):
+        table, unused = tables[name], OF_FORMATS if each.signals else OF_COLUMNS
+        if places := [own.at(key) for own in (table, *[files.data] * alike) for key in unused if key in own]:
             why = "the columns are named here" if each.signals else "the format of the file defines it"
-            raise BadSession(f"{table.at(unused)} has no effect, as {why}; remove it")
+            raise BadSession(f"{places[0]} has no effect, as {why}; remove it")
         if name in devices:
             measured[name] = files.take_sensor(name, table, each, devices)
         else:

@@ -80,7 +80,7 @@ def write_motion_table(path: Path, motion: Motion) -> list[Diagnostic]:
         angles = joint_angles(motion.pose)
         rows = pl.concat([rows, angle_table(angles).drop("time")], how="horizontal")
         diagnostics = diagnose_lock(angles)
-    if not path.name.removesuffix(".partial").endswith(".csv"):
+    if not path.name.lower().removesuffix(".partial").endswith(".csv"):
         write_table(path, rows)
     else:
         with path.open("wb") as file:  # polars takes only a path in UTF-8
@@ -265,6 +265,8 @@ def _choose_format(file: Path, name: str | None) -> str:
     if name not in formats:
         raise BadOption(f"--format {name}: not known; {one_of(formats, name)}")
     needed = f".{name}" if formats[name].suffix is None else formats[name].suffix
+    if not needed and suffix.removeprefix(".") in (*formats, "bag", "db3"):  # readers would take it for a file
+        raise BadOption(f"-o {file}: format {name} is a folder; name it {file.stem}")
     if needed and suffix != needed:
         raise BadOption(f"-o {file}: format {name} is for programs that go by the suffix: name it {file.stem}{needed}")
     return name

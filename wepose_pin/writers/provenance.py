@@ -106,7 +106,7 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     if path.suffix != ".toml" or not path.is_file():  # a pipe would block
         return []
     names, content = set(), dict[str, Any]()
-    with contextlib.suppress(OSError, ValueError):  # its reader reports what is wrong
+    with contextlib.suppress(OSError, ValueError, RecursionError):  # its reader reports what is wrong
         content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
 
     def visit(table: Mapping[str, Any]) -> None:
