@@ -531,6 +531,7 @@ def test_a_description_beside_the_session_is_read(stated: str, tmp_path: Path) -
     ("change", "says"),
     [
         (("[xyz]", "[xyz"), r"lab\.toml: '.*' is no regular expression"),
+        (("(?P<axis>[xyz])", "[xyz]"), r"gyro 1\.columns = \['.*'\]; \(\?P<axis>\.\.\.\) is needed in it"),
         (("unit_s", "unit"), r"clock 1\.unit is not a known key; did you mean 'unit_s'"),
         (("[[clock]]", "[[accel]]"), "is not a known key"),
         (('"mg"', '"furlong"'), r"'chest fx' is in 'furlong'; there is: m/s\^2, g, mg"),

@@ -173,6 +173,8 @@ def load_format(path: Path) -> TableFormat:
             if len(columns.columns) not in counts:
                 needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
                 raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {needed} are needed")
+            if len(columns.columns) == 1 and "(?P<axis>" not in columns.columns[0]:
+                raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; (?P<axis>...) is needed in it")
             patterns += columns.columns if len(columns.columns) == 1 else ()
     for text in patterns:
         try:
