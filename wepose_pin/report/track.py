@@ -236,8 +236,8 @@ def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
             rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, std, near_lock])
     stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
     return [
-        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs: elevation is "
-        "negative where the arm is raised, pronation is 90° with the palms at the thighs."
+        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs: an angle named "
+        "elevation is negative where the arm is raised, pronation is 90° with the palms at the thighs."
         f"{stated if has_stated_mounts(tracked) else ''}",
         draw_joint_angles(angles),
         Table("", ["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
