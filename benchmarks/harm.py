@@ -10,7 +10,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.rotations import heading
-from wepose_pin.simulation import MTI_3, PRESETS, ImuNoise, Simulation, simulate, simulate_activity, simulate_person
+from wepose_pin.simulation import (
+    MTI_3,
+    NOISE_FREE,
+    PRESETS,
+    Imperfections,
+    ImuNoise,
+    Simulation,
+    simulate,
+    simulate_activity,
+    simulate_person,
+)
 from wepose_pin.simulation.activities import ACTIVITIES
 from wepose_pin.tracking import TrackResult, track
 
@@ -18,7 +28,15 @@ from .tables import Column, Section, Table
 
 GOOD = MTI_3  # 0.007 deg/s/√Hz, 10 deg/h
 POOR = replace(MTI_3, gyro_density=np.deg2rad(0.03), gyro_bias_instability=np.deg2rad(100.0) / 3600.0)
-GYROSCOPES = {"good": GOOD, "poor": POOR}
+GYROSCOPES = {"good": GOOD, "poor": POOR, "perfect": NOISE_FREE}
+# With perfect gyroscopes nothing else of a sensor is wrong either: what remains of a heading's error is the person's.
+PERFECT_SENSOR = {
+    name: getattr(Imperfections(), name)
+    for name in (
+        *("gyro_scale", "accel_scale", "misalignment_deg", "g_sensitivity_deg_s", "gyro_warm_up_deg_s", "dropped"),
+        *("gyro_range_deg_s", "accel_range_g", "bits", "clock_jitter", "clock_offset", "clock_drift_ppm"),
+    )
+}
 WAYS = ("open", "offline", "causal")
 SECONDS = 60.0
 SCORED_FROM_S = 8.0  # the activity has begun
@@ -53,7 +71,8 @@ def sections(quick: bool) -> list[Section]:
         for gyroscope in GYROSCOPES
         for averaged in (False, True)
         for rate_hz in ((100.0,) if quick else (50.0, 100.0, 400.0))
-        if not quick or averaged == (activity in ("run", "throw"))
+        if gyroscope != "perfect" or (preset == "people" and rate_hz == 100.0 and not averaged)
+        if not quick or gyroscope == "perfect" or averaged == (activity in ("run", "throw"))
     ]
     return [partial(measure_harm, cases, range(1, 2 if quick else 4))]
 
@@ -79,7 +98,7 @@ def measure_harm(cases: list[Case], seeds: range) -> Table:
         for way in ("offline", "causal"):
             if row[way] > HARMLESS_RATIO * row["open"] + HARMLESS_DEG:
                 harmed.append(f"{case.name} ({way})")
-            elif row["open"] > LARGE_DEG and row[way] > 0.5 * row["open"]:
+            elif case.gyroscope != "perfect" and row["open"] > LARGE_DEG and row[way] > 0.5 * row["open"]:
                 small.append(f"{case.name} ({way})")
     limit = f"{HARMLESS_RATIO:g} times the open loop and {HARMLESS_DEG:g} deg"
     table.notes += [
@@ -109,6 +128,8 @@ def simulate_case(case: Case, seed: int) -> Simulation:
     """Simulate one person of a case."""
     noise: ImuNoise = GYROSCOPES[case.gyroscope]
     sizes = replace(PRESETS[case.preset], accel_average=1.0 if case.averaged else 0.0)
+    if case.gyroscope == "perfect":
+        sizes = replace(sizes, **PERFECT_SENSOR)
     if case.activity in ACTIVITIES:
         return simulate_activity(
             case.activity, seed=seed, rate_hz=case.rate_hz, noise=noise, imperfections=sizes, seconds=SECONDS
