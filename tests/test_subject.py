@@ -94,6 +94,8 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
             "ALL\n[covariance]\norder = ['trunk']\nmatrix = [[1.0, 2.0]]",
             "covariance has the shape (1, 2); (1, 1) is needed",
         ),
+        ("ALL\n[covariance]\norder = ['trunk', 'trunk']\nmatrix = [[1.0, 0.0], [0.0, 1.0]]", "names a row twice"),
+        ("ALL\n[mounts.torso]\nqx = 0\nqy = 0\nqz = 0\nqw = 1\nqv = 0", "mounts.torso.qv is not a known key"),
         ("ALL\n[covariance]\norder = ['trunk']\nmatrix = [['a']]", "covariance.matrix: rows of numbers are needed"),
         (
             "ALL\n[start_pose_offset.tors]\nx_deg = 1\ny_deg = 1\nstd_deg = 1",

@@ -68,6 +68,11 @@ TABLES: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
     ),
     (
         "",
+        (SEGMENT, 'forearm_link = { link = "forearm_link", labels = "(" }'),
+        ("segments.forearm_link.labels", "no regular expression"),
+    ),
+    (
+        "",
         (SEGMENT, 'forearm_link = { link = "forearm_link", start_std_deg = [1, 2] }'),
         ("segments.forearm_link.start_std_deg", "[1, 2]"),
     ),

@@ -191,6 +191,7 @@ class Key:
     of: str = ""  # what texts name; `read_record` is given the names that there are
     words: Mapping[str, Any] = field(default_factory=dict, hash=False)  # text in the file → value of the field
     each: tuple[str, ...] = ()  # the keys of an array's numbers
+    unread: tuple[str, ...] = ()  # keys beside those, for whoever looks at the file
     digits: int | None = None  # decimals that are written; None: all that count
 
     @property
@@ -249,6 +250,8 @@ def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Colle
         entries, values = table.table(key.name), dict(base or {})
         for name in entries.values:
             own = entries.table(name) if key.each else entries
+            if key.each:
+                own.allow(*key.each, *key.unread)
             values[name] = _read_value(parts[1], own, replace(key, name=name), known, values.get(name))
         return values
     if key.each:

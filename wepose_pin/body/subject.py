@@ -48,7 +48,7 @@ MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person ha
 _OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4)
 _DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=4)  # of a heading: up to 100 deg/s
 _UNIT = Key(least=-1.001, most=1.001, digits=9)  # of a component of a unit vector
-_MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"))
+_MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",))
 _GIRDLE = Key(least=-LONGEST, most=LONGEST, each=PARAMETERS, digits=6)
 _COMMENT = "# Lengths and girdles in m; mounts turn the sensor's frame to the segment's; see docs/calibrate.md"
 
@@ -174,6 +174,8 @@ class Subject:
         try:
             named = [row for row in self.order if not _ROW.fullmatch(row)]
             check_names(f"{where}covariance.order", named, self.lengths)
+            if len(set(self.order)) < len(self.order):
+                raise BadData(f"{where}covariance.order names a row twice")
             check_numbers(f"{where}covariance", self.covariance, (len(self.order),) * 2)
             for name, (values, size) in arrays.items():
                 unit = 1e-3 if name.startswith(("mounts", "hinges")) else np.inf

@@ -327,7 +327,7 @@ def read_table(path: Path) -> BodyTable:
     poses: Any = {NEUTRAL_POSE: {}}
     base = prune_table(replace(like, **file, kind=kind, segments=segments, points=points, poses=poses))
     known: dict[str, Any] = {key: {**getattr(base, key), **values} for key, values in own.items()}
-    known |= {"names": {name for each in known.values() for name in each}, "axes": AXES}
+    known |= {"names": dict.fromkeys(name for each in known.values() for name in each), "axes": AXES}
     table = read_record(BodyTable, top, known | {"points": {**known["points"], ROOT: None}}, base, others=("like",))
     if not table.segments:
         raise BadModel(f'{top.at("segments")} is missing; each segment\'s link is needed, as in torso = "chest_link"')
@@ -355,7 +355,7 @@ def _normalise_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
 
 
 def _check_table(table: BodyTable, top: TomlTable) -> None:
-    """Raise `BadModel` on names that the table does not know, and on parallel axes."""
+    """Raise `BadModel` on names that the table does not know, parallel axes, and labels that are no expression."""
     names = (*table.segments, *table.points, *table.lengths, *table.hinges)
     for key, used, known in (
         ("girdles", table.girdles, table.points),
@@ -373,6 +373,11 @@ def _check_table(table: BodyTable, top: TomlTable) -> None:
         if segment.up is not None or segment.forward is not None:
             axes = {"up": segment.up, "forward": segment.forward}
             read_axes(replace(top, values=axes, place=f"segments.{name}."))
+        try:
+            re.compile(segment.labels)
+        except re.error as error:
+            labels = f"{top.at('segments')}.{name}.labels = {segment.labels!r}"
+            raise BadModel(f"{labels} is no regular expression: {error}") from None
 
 
 def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
