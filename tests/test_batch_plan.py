@@ -86,6 +86,7 @@ HEAD = '[sessions]\nfiles = "anna/*"\n'
         (f'{HEAD}[subjects.anna]\nfile = "a"\ncalibration = "b"\n[steps.track]', "not both"),
         (f'{HEAD}[subjects.a]\nfile = "nobody"\n[steps.track]', "nobody: no such file"),
         (f"{HEAD}[subjects.a]\nmeasured = {{ arm = 1 }}\n[steps.track]", "measured.arm is not a known"),
+        (f'{HEAD}[steps.track]\nmodel = "arm.urdf"', "steps.track: --model arm.urdf: no such file"),
         (f"{HEAD}[subjects.a]\nstature = 0\n[steps.track]", "subjects.a: stature 0 is not a body height"),
         (f"{HEAD}[subjects.a]\nstature = 170\n[steps.track]", "subjects.a: stature 170 is not a body height"),
     ],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter, Token, validators
 
-from ..errors import BadOption
+from ..errors import BadOption, WrongOption
 
 MORE = Parameter(group=Group("More options", sort_key=2))
 RESEARCH = Parameter(group=Group("Options for research", sort_key=3))
@@ -25,6 +25,14 @@ def _read_whole_number(_kind: type, tokens: Sequence[Token]) -> int:
     if not tokens[0].value.lstrip("-").isdecimal():  # cyclopts would round it
         raise ValueError(f"'{tokens[0].value}' is not a whole number")
     return int(tokens[0].value)
+
+
+def _check_model(_kind: type, model: str | None) -> None:
+    """A batch learns of a misspelt file before it calibrates."""
+    if model is not None and Path(model).suffix and not Path(model).is_file():
+        raise WrongOption(
+            "model", model, "no such file; a URDF, a TOML that names one, or the name of a body is needed"
+        )
 
 
 def _checked_by(place: str) -> Parameter:
@@ -89,7 +97,7 @@ Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
 OutFile = Annotated[Path, Parameter(alias="-o", metavar="FILE")]
 Subject = Annotated[Path, Parameter(metavar="SUBJECT")]
 Session = Annotated[Path, Parameter(metavar="SESSION")]
-Model = Annotated[str, Parameter(metavar="NAME|FILE")]
+Model = Annotated[str, Parameter(metavar="NAME|FILE", validator=_check_model)]
 File = Annotated[Path, Parameter(metavar="FILE")]
 Name = Annotated[str, Parameter(metavar="NAME")]
 Number = Annotated[int, Parameter(metavar="NUMBER", converter=_read_whole_number)]
