@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
 from wepose_pin import ImuSensor, Recording, Simulation, WeposeError, estimate_orientation, load_session, track
+from wepose_pin.recording.plausibility import find_unseen_rate
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 
@@ -270,6 +271,12 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(
         checked(180.0 / np.pi)
     with pytest.raises(WeposeError, match='"rad/s" would fit'):
         checked(np.pi / 180.0)
+
+
+def test_arms_that_move_are_not_said_to_be_in_another_unit_live(data: Path) -> None:
+    for imu in load_session(data / "upper_body").imus.values():
+        for rows in np.arange(len(imu.gyro_S) - len(imu.gyro_S) % 400).reshape(-1, 400):
+            assert np.isnan(find_unseen_rate(imu.gyro_S[rows], imu.accel_S[rows], RATE))
 
 
 @pytest.mark.parametrize("scale", [np.pi / 180.0, 0.5, 1.0])

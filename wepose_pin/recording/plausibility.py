@@ -32,7 +32,7 @@ FEWEST_WINDOWS, WINDOWS = 2, 20  # number of windows, those with most motion
 TUMBLES, STIFF, COHERENT = 0.7, 0.95, 0.8
 # Over some seconds in which accel alone is `STEADY`, rates in the right unit do not lower coherence below `UNTURNED` of
 # it: in four seconds 6 deg/s do, as does the sway of a start pose in deg/s that is taken for rad/s.
-STEADY, UNTURNED = 0.99, 0.995
+STEADY, UNTURNED = 0.997, 0.995
 
 
 def check_signals(recording: Recording) -> tuple[Diagnostic, ...]:
