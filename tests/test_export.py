@@ -153,6 +153,23 @@ def test_c3d_marks_what_hangs_on_a_gap(tmp_path: Path, pose: Pose) -> None:
     assert hit == {name: list(range(10, 20)) for name in ("right_forearm", "right_hand")}
 
 
+def test_c3d_on_a_full_disk_leaves_the_earlier_file(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ezc3d = pytest.importorskip("ezc3d")
+    (tmp_path / "x.c3d").write_text("earlier")
+    whole = ezc3d.c3d.write
+
+    def write(file: object, path: str) -> None:
+        whole(file, path)
+        Path(path).write_bytes(Path(path).read_bytes()[:-512])
+
+    monkeypatch.setattr(ezc3d.c3d, "write", write)
+    with pytest.raises(ExistingOutput, match=r"x\.c3d: cannot be written: the disk seems to be full"):
+        export(result, tmp_path / "x.c3d", force=True)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("x.c3d", "earlier")]
+
+
 # BVH --------------------------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ labelled ``…_4X4``, with the translation in the unit of the points.
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,10 @@ def write_c3d(path: Path, motion: Motion) -> None:
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
     try:
         file.write(str(named))
+        content, size = named.read_bytes(), (16 * len(points) + 68 * len(motion.pose.quat_WL)) * n
+        # ezc3d raises no error of a full disk. Word 9 of the header is the first block of the data.
+        if len(content) < 512 * (int.from_bytes(content[16:18], "little") - 1) + size:
+            raise OSError(errno.ENOSPC, "the disk seems to be full")
         named.replace(path)
     finally:
         named.unlink(missing_ok=True)

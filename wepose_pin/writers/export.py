@@ -218,7 +218,8 @@ def export(
         if provenance is not None and kind.earlier:
             write_provenance(partial, provenance)
         elif provenance is not None:
-            write_provenance(file.parent, provenance, f"{file.name}.provenance.json")
+            beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
+            write_provenance(beside.parent, provenance, beside.name)
     return written
 
 
