@@ -125,6 +125,7 @@ def test_the_command_writes_joints_orientations_and_torques(urdf: Path, data: Pa
     assert joints.columns == ["time", *UR5]
     assert {"forearm_link_qw", "wrist_1_link_qx", "wrist_1_link_std"} <= set(pose.columns)
     assert len(joints) == len(pose) == len(pl.read_parquet(out / "torques.parquet"))
+    assert "the orientation of each link to ±" in (out / "report.html").read_text(encoding="utf-8")
 
     read = load_result(out)
     assert list(read.model.table.segments) == ["forearm_link", "wrist_1_link"]

@@ -107,6 +107,9 @@ def _describe_reliance(tracked: TrackResult, measures: TrackSummary, angles: Ang
         root = "the root" if table.is_mechanism else "the middle of the hips"
         good.append(f"{_name_tips(table, table.drawn_limbs)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
     good += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
+    if not good and tracked.pose.segment_cov:  # of a mechanism
+        variances = [np.median(np.diagonal(cov[after_start], 0, 1, 2), 0) for cov in tracked.pose.segment_cov.values()]
+        good = [f"the orientation of each link to ± {np.degrees(np.sqrt(np.max(variances))):.1f}°"]
     least = f" Least certain: {worst}, ± {stds[worst]:.0f}°." if worst not in (best, None) else ""
     return f"**Good for** {listed(good)}.{least}" if good else _explain_no_covariance(tracked)
 

@@ -53,6 +53,9 @@ class SegmentOrientations:
     static_phase: tuple[float, float]  # [s] from which noise and bias are
     diagnostics: tuple[Diagnostic, ...]  # of the recording, its start pose and its mounts
 
+    def __repr__(self) -> str:
+        return f"SegmentOrientations({self.recording!r}, {self.options.method})"
+
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
     """Compute the variance (n,) [rad²] of the heading from the covariance (n, 3, 3) [rad²] of the attitude error.
