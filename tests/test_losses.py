@@ -25,6 +25,8 @@ class LateSource(Source):
 def count(time_s: np.ndarray) -> int:
     """Missing samples of a sensor whose status is updated every seven samples."""
     monitor = SensorMonitor(LateSource())
+    empty = np.zeros((0, 3))
+    monitor.push([Samples("torso", np.zeros(0), empty, empty)])  # of a plug-in that has read nothing
     for k in range(0, len(time_s), 7):
         rows = np.zeros((len(time_s[k : k + 7]), 3))
         monitor.push([Samples("torso", time_s[k : k + 7], rows, rows)], ["torso"])

@@ -33,11 +33,13 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
     What this package brings is registered in the same way, in pyproject.toml. It stands first, and its names are taken.
     """
-    found = sorted(entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin."))
-    if not found or not found[0].value.startswith("wepose_pin."):
+    registered = sorted(
+        entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin.")
+    )
+    if not registered or not registered[0].value.startswith("wepose_pin."):
         raise BadOption(f"no {group} of wepose-pin are registered: install the package again")
     plugins: dict[str, EntryPoint] = {}
-    for each in found:
+    for each in registered:
         plugins.setdefault(each.name, each)
     return plugins
 
@@ -54,8 +56,8 @@ def load_plugin(group: str, name: str) -> Any:
 def check_file(path: Path, kind: str) -> None:
     """Raise `MissingFile` where `path` is no regular file; its `kind` is such as "a C3D"."""
     if not path.is_file():
-        found = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
-        raise MissingFile(f"{path}: {found}; {kind} is wanted here")
+        state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
+        raise MissingFile(f"{path}: {state}; {kind} is wanted here")
 
 
 def import_library(module: str, path: Path | str, kind: str) -> Any:

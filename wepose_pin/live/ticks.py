@@ -61,7 +61,7 @@ class SensorMonitor:
 
     def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
         """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
-        for chunk in samples:
+        for chunk in (each for each in samples if len(each.time)):
             self._times.setdefault(chunk.sensor, []).append(chunk.time)
             self._arrived[chunk.sensor] = self._source.clock()
             self.sending[chunk.sensor] = float(chunk.time[-1])

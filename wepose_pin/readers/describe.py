@@ -284,10 +284,10 @@ def _list_siblings(path: Path, format: str) -> list[Path]:
 
 def _list_files_like(path: Path) -> list[Path]:
     """List the files beside one, of its suffix, or the folders beside one."""
-    beside = [path.parent / file.name for file in sorted(path.absolute().parent.iterdir())]
+    siblings = [path.parent / file.name for file in sorted(path.absolute().parent.iterdir())]
     if path.is_dir():
-        return [file for file in beside if file.is_dir()][:MOST_SIBLINGS]
-    return [file for file in beside if file.suffix == path.suffix and file.is_file()][:MOST_SIBLINGS]
+        return [file for file in siblings if file.is_dir()][:MOST_SIBLINGS]
+    return [file for file in siblings if file.suffix == path.suffix and file.is_file()][:MOST_SIBLINGS]
 
 
 # From names of columns or arrays -----------------------------------------------------------------------------------

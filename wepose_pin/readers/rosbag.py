@@ -30,16 +30,16 @@ def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None
     if not frames:
         raise BadData(f"{path}: no messages of type {MESSAGE} in it; record the topics of the IMUs")
     topics = [topic for topic, _ in frames]
-    found, hints = {}, {}
+    signals, hints = {}, {}
     for (topic, frame), messages in frames.items():
         label = topic if topics.count(topic) == 1 else f"{topic} {frame}"
         numbers = np.array(messages)
         time, has_raw, has_orientation = NS * numbers[:, 0], numbers[:, 1].all(), numbers[:, 2].all()
         raw = {"gyro": Signal(time, numbers[:, 3:6]), "accel": Signal(time, numbers[:, 6:9])}
         orientation = {"orientation": Signal(time, numbers[:, 9:13])}
-        found[label] = (raw if has_raw else {}) | (orientation if has_orientation else {})
+        signals[label] = (raw if has_raw else {}) | (orientation if has_orientation else {})
         hints[label] = frame
-    return make_device(path, found, NEEDS, use, rate_hz, hints=hints)
+    return make_device(path, signals, NEEDS, use, rate_hz, hints=hints)
 
 
 def _read_messages(path: Path) -> dict[tuple[str, str], list[list[float]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
@@ -97,7 +98,8 @@ def write_pages(folder: Path, pages: Mapping[str, Callable[[], str] | None]) -> 
     `pages`: file name → what makes its text; None: it is not made. Pages of an earlier result are removed first.
     """
     for name in pages:
-        (folder / name).unlink(missing_ok=True)
+        with suppress(OSError):  # else writing it fails too, which is reported below
+            (folder / name).unlink(missing_ok=True)
     diagnostics = []
     for name, make in pages.items():
         if make is None:

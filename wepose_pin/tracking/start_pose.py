@@ -76,11 +76,11 @@ class StartPoseDetector:
         self._gyro[self._held] = gyro_S
         self._held += 1
         if self._held % self._every == 0 or self._held == self._hold:
-            held = self._gyro[: self._held]
-            last = held[-self._window :]
-            mean, degrees = held.mean(axis=0), np.degrees(1.0)
+            rates = self._gyro[: self._held]
+            last = rates[-self._window :]
+            mean, degrees = rates.mean(axis=0), np.degrees(1.0)
             rate = degrees * np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
-            turned = degrees * np.linalg.norm(np.cumsum(held - mean, axis=0) / self._rate, axis=2).max(axis=0)
+            turned = degrees * np.linalg.norm(np.cumsum(rates - mean, axis=0) / self._rate, axis=2).max(axis=0)
             steady = degrees * np.linalg.norm(mean, axis=1)
             moves = (rate > SWAYS_DEG_S) | (turned > SWAYS_DEG) | (steady > SWAYS_DEG_S)
             if moves.any():

@@ -218,8 +218,8 @@ def export(
         if provenance is not None and kind.earlier:
             write_provenance(partial, provenance)
         elif provenance is not None:
-            beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
-            write_provenance(beside.parent, provenance, beside.name)
+            record = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
+            write_provenance(record.parent, provenance, record.name)
     return written
 
 
