@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shlex
@@ -21,6 +22,7 @@ from commands import options, run
 import wepose_pin as wp
 from wepose_pin import Recording, Simulation, __version__, load_subject
 from wepose_pin.commands.command_line import COMMANDS, parse
+from wepose_pin.commands.options import read_descriptions
 from wepose_pin.writers import write_session
 
 
@@ -63,6 +65,20 @@ def test_help_is_grouped(capsys: pytest.CaptureFixture[str]) -> None:
     groups = ("\nOptions:", "  --subject", "\nMore options:", "  --torques", "\nOptions for research:", "  --open-loop")
     places = [text.index(word) for word in groups]
     assert places == sorted(places)
+
+
+@pytest.mark.parametrize("name", ["track", "calibrate", "retarget", "export", "evaluate"])
+def test_a_command_and_its_function_share_their_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each has one default and one description; the method of `wepose track` may be that of a live session."""
+    function, command = inspect.signature(getattr(wp, name)).parameters, options(name)
+    shared = {option for option in command if option in function} - {"out"}
+    assert shared >= {"track": {"method", "limits"}, "export": {"names"}, "retarget": {"scale"}}.get(name, set())
+    for option in shared - ({"method"} if name == "track" else set()):
+        assert command[option].default == function[option].default, option
+    assert run(name, "--help") == 0
+    text, described = "".join(capsys.readouterr().out.split()), read_descriptions(getattr(wp, name).__doc__)
+    for option in shared - {"force", "model", "method"}:
+        assert "".join(described[option].split())[1:60] in text, option  # of a switch that is on: "Do not keep"
 
 
 @pytest.mark.slow

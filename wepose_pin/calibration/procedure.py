@@ -79,30 +79,31 @@ def calibrate(
     ----------
     recording : Recording
         With the phases of the protocol, "clasp" for joined hands.
-    measured : mapping, optional
-        Name → [m] that was measured on the person: a length of the body such as "shoulder_width"; the breadth
-        "biacromial", from which a length follows. Without any the scale is the prior's.
+    measured : mapping of names to [m], optional
+        Use these measured lengths: biacromial, the breadth over the bony edges on top of the shoulders, or a name of
+        [lengths] in subject.toml, such as left_forearm, from joint centre to joint centre. Without any the scale is
+        that of the prior.
     prior : Subject, optional
-        Lengths with covariance, and mounts, as known before: the subject of an earlier calibration is combined with
-        what this recording shows. None: `population_subject(stature, sex)`.
+        Use the subject of an earlier calibration of the same person as the prior, so that each session adds to what is
+        known; its mounts too, unless the session has remounted = true. Without it the population prior.
     stature : float, optional
-        [m] the person's body height, which narrows the population prior.
-    sex : str, optional
-        "f" or "m", which narrows the population prior.
+        Narrow the population prior to people of this body height [m].
+    sex : "f" or "m", optional
+        Narrow the population prior to women or men.
     model : BodyModel, str or Path, optional
-        The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
+        As in `track`.
     protocol : str, Path or Protocol, optional
-        What the person did in which phase: the name of a protocol, such as "clasp" or "free", a .toml file, or what
-        `wepose_pin.calibration.load_protocol` returned; None: "clasp", with "t_pose" and "bow" if the recording has
-        those phases and the formulation is not "paper".
+        Calibrate by this protocol, or several joined by +, as in clasp+t_pose: clasp (hands together), t_pose (arms
+        sideways), bow (the trunk bends forwards), table (both palms on a table), tip (of a robot's arm: its point "tip"
+        on a fixed point), free (any motion: headings and mounts alone), or a file of your own, made like those in
+        calibration/. Without it clasp, and t_pose and bow where the session has those phases.
     method : str
-        The orientation filter: "amekf", "smoother", "smekf", "smekf_published", "ncf" or "gdc", as in
-        `estimate_orientation`.
+        As in `track`.
     measured_std : float
         Standard deviation [m] of each measured value; 3 mm by default.
-    formulation : str
-        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by the
-        plain least squares of Lisini Baldi et al. 2019, which needs a measured length.
+    formulation : "full" or "paper"
+        Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
+        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, with stated mounts and a measured length).
 
     Returns
     -------

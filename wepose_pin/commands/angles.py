@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ..errors import BadOption, WrongOption
-from .options import MORE, Angle, Force, Hz, Interval, Out, Phase, PhaseName
+from .options import MORE, Angle, Force, Hz, Interval, Out, PhaseName, described_by
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
@@ -16,13 +16,14 @@ PAGE = "angles.html"
 DECIMALS = 4  # of tables; degrees and seconds
 
 
+@described_by("writers/export.py:export")
 def angles(
     result: Path,
     /,
     *further: Path,
     out: Out,
     interval: Interval | None = None,
-    phase: Phase | None = None,
+    phase: PhaseName | None = None,
     low_pass_hz: Hz | None = None,
     force: Force = False,
     repetitions: Annotated[PhaseName | None, MORE] = None,

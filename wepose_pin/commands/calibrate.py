@@ -12,20 +12,21 @@ from .options import (
     RESEARCH,
     Force,
     Formulation,
-    Gaps,
     Measured,
-    MethodOption,
+    Method,
     Model,
     Out,
     ProtocolName,
     Stature,
     Subject,
+    described_by,
 )
 from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
 
 
+@described_by("tracking/__init__.py:track", "calibration/procedure.py:calibrate", "readers/__init__.py:load_session")
 def calibrate(
     session: Path,
     /,
@@ -37,10 +38,10 @@ def calibrate(
     protocol: ProtocolName | None = None,
     model: Model | None = None,
     prior: Subject | None = None,
-    gaps: Gaps = False,
+    gaps: bool = False,
     report: bool = True,
     force: Force = False,
-    method: Annotated[MethodOption, RESEARCH] = "amekf",
+    method: Annotated[Method, RESEARCH] = "amekf",
     formulation: Annotated[Formulation, RESEARCH] = "full",
 ) -> Outcome:  # of a Calibration
     """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
@@ -62,29 +63,12 @@ def calibrate(
     out
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     measured
-        Use this measured length; may be given several times: biacromial=0.41, the breadth over the bony edges on top of
-        the shoulders, or a name of [lengths] in subject.toml, such as left_forearm, from joint centre to joint centre.
-    stature
-        Narrow the population prior to people of this body height.
-    sex
-        Narrow the population prior to women or men.
-    protocol
-        Calibrate by this protocol, or several joined by +, as in clasp+t_pose: clasp (hands together), t_pose (arms
-        sideways), bow (the trunk bends forwards), table (both palms on a table), tip (of a robot's arm: its point "tip"
-        on a fixed point), free (any motion: headings and mounts alone), or a file of your own, made like those in
-        calibration/. Without it clasp, and t_pose and bow where the session has those phases.
-    model
-        Calibrate this body (docs/models.md). Without it the body that the session names, else upper_body.
+        May be given several times, as in biacromial=0.41.
     prior
-        Use as the prior this subject.toml, or the one in this folder, of an earlier calibration of the same person, so
-        that each session adds to what is known; its mounts too, unless the session has remounted = true. Of an Xsens
-        .mvnx only the lengths are used.
+        SUBJECT is a subject.toml or its folder; of an Xsens .mvnx only the lengths are used.
     report
         Write report.html, which shows the quality and what to do about it, lengths, mounts and the gap between the
         palms.
-    formulation
-        Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
-        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, with stated mounts and a measured length).
     """
     options = dict(locals())
     from .. import calibration as room

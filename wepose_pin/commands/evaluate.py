@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..diagnostics import Diagnostic
 from ..errors import BadOption, WrongOption
-from .options import MORE, File, Interval, Phase, Seconds
+from .options import MORE, File, Interval, PhaseName, Seconds, described_by
 from .output import print_diagnostics, print_table, progress_bar, say
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation, Registration
 
 
+@described_by("evaluation/scores.py:evaluate", "writers/export.py:export")
 def evaluate(
     result: Path,
     truth: Path,
     /,
     *,
     interval: Interval | None = None,
-    phase: Phase | None = None,
+    phase: PhaseName | None = None,
     align: Annotated[bool, MORE] = True,
     fit: Annotated[Literal["world", "segments"] | None, MORE] = None,
     time_offset: Annotated[Seconds | None, MORE] = None,

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from .options import MORE, ExportHz, File, Force, Interval, Name, OutFile, Phase, PhaseName, Text
+from .options import MORE, ExportHz, File, Force, Interval, Name, OutFile, PhaseName, Text, described_by
 from .output import print_diagnostics, progress_bar, say
 
 
+@described_by("writers/export.py:export")
 def export(
     result: Path,
     /,
@@ -17,7 +18,7 @@ def export(
     format: Name | None = None,
     rate_hz: ExportHz | None = None,
     interval: Interval | None = None,
-    phase: Phase | None = None,
+    phase: PhaseName | None = None,
     force: Force = False,
     names: Annotated[Literal["isb", "opensim"] | None, MORE] = None,
     osim_model: Annotated[File | None, MORE] = None,
@@ -38,24 +39,6 @@ def export(
         Only for lerobot: further results, which become episodes of the same data set.
     out
         Write this file. Its suffix selects the format.
-    format
-        Write this format instead of that of the suffix. Of a person: csv, parquet (pose and joint angles), mot (joint
-        angles for OpenSim), sto (orientations for OpenSense), placement (of OpenSim's IMU Placer), scale (of OpenSim's
-        Scale Tool, .xml), trc, c3d, bvh. Of a person or a robot: rosbag (for ROS 2, in a folder), mcap, rrd (for
-        rerun), urdf. Of robots: lerobot (a data set of episodes, in a folder; joints in rad).
-    rate_hz
-        Resample the motion at this rate.
-    names
-        Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
-        coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.
-    osim_model
-        Only for .sto and scale: name this model in the set-up files that are written, with .sto those of OpenSim's IMU
-        Placer and IMU Inverse Kinematics. Without it scale names Rajagopal_2015.osim.
-    episodes
-        Only for lerobot: make each interval of this phase of the recording an episode, or, by the word repetitions,
-        each repetition of the movement. Without it each result is an episode.
-    instruction
-        Only for lerobot: say what the robot does by this text. Without it "follow", and the name of the recording.
     """
     options = dict(locals())
     from ..writers import export as room

@@ -17,12 +17,11 @@ from ..libraries import find_plugins, load_plugin
 from .options import (
     MORE,
     RESEARCH,
-    AcceptFailed,
     Address,
     File,
     Folder,
     Force,
-    LiveMethodOption,
+    LiveMethod,
     Measured,
     Model,
     Name,
@@ -34,6 +33,7 @@ from .options import (
     Speed,
     Stature,
     Subject,
+    described_by,
 )
 from .output import print_diagnostics, print_table, say
 from .stopping import stop_requests
@@ -56,6 +56,7 @@ class Live(NamedTuple):
     robot: RobotOutput | None
 
 
+@described_by("tracking/__init__.py:track")
 def live(
     *,
     source: Annotated[str, Parameter(metavar="SOURCE")],
@@ -80,8 +81,8 @@ def live(
     port: Annotated[Number, MORE] = 0,
     model: Annotated[Model | None, MORE] = None,
     speed: Annotated[Speed, MORE] = "1",
-    accept_failed: Annotated[AcceptFailed, MORE] = False,
-    method: Annotated[LiveMethodOption, RESEARCH] = "amekf",
+    accept_failed: Annotated[bool, MORE] = False,
+    method: Annotated[LiveMethod, RESEARCH] = "amekf",
     views: Annotated[Sequence[Any] | None, UNSEEN] = None,
     until: Annotated[Callable[[], bool] | None, UNSEEN] = None,
 ) -> Live:
@@ -99,8 +100,7 @@ def live(
         Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,... or slimevr:[HOST]
         (docs/live-sources.md). Without HOST only this machine can send.
     subject
-        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
-        Without it lengths are those of the population prior, and mounts those that --session states.
+        SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it.
     session
         Take the mounts of the sensors from this session file; its data are not read.
     setup
@@ -145,9 +145,6 @@ def live(
         holds a token, without which nobody can open it. Without --host this machine alone can open the page.
     port
         Serve the page at this port; 0 takes any that is free.
-    model
-        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package
-        (docs/models.md). Without it the body that the session names, else the upper body.
     speed
         With --source replay: replay at this speed; 1 is that of the recording, 4 is four times that, max is as fast as
         possible.

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
-from collections.abc import Mapping, Sequence
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from cyclopts import Group, Parameter, Token, validators
 
@@ -19,6 +22,41 @@ Method = Literal["amekf", "smoother", "smekf", "smekf_published", "ncf", "gdc"]
 LiveMethod = Literal["amekf", "smekf", "smekf_published", "ncf", "gdc"]
 Formulation = Literal["full", "paper"]
 Arms = Literal["left", "right", "both"]
+
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+_PACKAGE = Path(__file__).parents[1]
+_PARAMETERS = "Parameters\n----------\n"
+
+
+def described_by(*functions: str) -> Callable[[Command], Command]:
+    """Take the help of a command's options from functions ``FILE:NAME`` of the package, the first that has the option.
+
+    Their docstrings are read from the source: importing those rooms takes a second. What the command's own docstring
+    says of an option follows.
+    """
+
+    def complete(command: Command) -> Command:
+        shared: dict[str, str] = {}
+        for place in functions:
+            file, _, name = place.partition(":")
+            tree = ast.parse((_PACKAGE / file).read_text(encoding="utf-8"))
+            function = next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name)
+            shared = read_descriptions(ast.get_docstring(function)) | shared
+        own = read_descriptions(command.__doc__)
+        texts = {name: f"{shared.get(name, '')} {own.get(name, '')}" for name in inspect.signature(command).parameters}
+        head = inspect.cleandoc(command.__doc__ or "").partition(_PARAMETERS)[0]
+        command.__doc__ = head + _PARAMETERS + "".join(f"{name}\n    {text.strip()}\n" for name, text in texts.items())
+        return command
+
+    return complete
+
+
+def read_descriptions(docstring: str | None) -> dict[str, str]:
+    """Parameter → its description in a NumPy docstring, in one line."""
+    section = inspect.cleandoc(docstring or "").partition(_PARAMETERS)[2].partition("\n\n")[0]
+    entries = re.findall(r"^(\w[\w, ]*?)(?: :.*)?\n((?:    .+\n?)+)", section, re.MULTILINE)
+    return {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
 
 
 def _read_whole_number(_kind: type, tokens: Sequence[Token]) -> int:
@@ -63,36 +101,8 @@ def _read_entries(numbers: bool, words: Sequence[Token]) -> dict[str, Any]:
     return entries
 
 
-# Options of several commands, with their help ------------------------------------------------------------------------
-
 Force = Annotated[bool, Parameter(help="Replace the files of an earlier run.")]
-AcceptFailed = Annotated[bool, Parameter(help="Use a subject even if its calibration failed, which is else refused.")]
-_GAPS = "Accept gaps of more than 50 ms: bridge them, and mark them in pose.parquet. Without it such a gap is an error."
-Gaps = Annotated[bool, Parameter(help=_GAPS)]
-Interval = Annotated[
-    tuple[float, float],
-    Parameter(metavar="FROM TO", help="Use only this time of the recording, in seconds."),
-    _checked_by("recording:check_selection"),
-]
-Phase = Annotated[
-    str,
-    Parameter(
-        metavar="NAME",
-        help="Use only this phase of the recording. Of a phase with several intervals NAME:2 is the second.",
-    ),
-]
-_FILTERS = (
-    "Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), {}smekf (Kalman filter of "
-    "Lisini Baldi et al. 2019, corrected in static phases, with an exact covariance and two more conditions of the "
-    "static test), smekf_published (the same as published), ncf (complementary filter, Mahony et al. 2008), gdc "
-    "(gradient descent, Madgwick et al. 2011)."
-)
-MethodOption = Annotated[Method, Parameter(help=_FILTERS.format("smoother (the same forward and backward in time), "))]
-LiveMethodOption = Annotated[LiveMethod, Parameter(help=_FILTERS.format(""))]
-
-
-# Values --------------------------------------------------------------------------------------------------------------
-
+Interval = Annotated[tuple[float, float], Parameter(metavar="FROM TO"), _checked_by("recording:check_selection")]
 Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
 OutFile = Annotated[Path, Parameter(alias="-o", metavar="FILE")]
 Subject = Annotated[Path, Parameter(metavar="SUBJECT")]

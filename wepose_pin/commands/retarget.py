@@ -7,10 +7,25 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ..diagnostics import from_json
-from .options import MORE, Arms, Factor, Force, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
+from .options import (
+    MORE,
+    Arms,
+    Factor,
+    Force,
+    Hz,
+    Interval,
+    Out,
+    PhaseName,
+    Radians,
+    RobotHz,
+    RobotName,
+    Share,
+    described_by,
+)
 from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 
+@described_by("retargeting/trajectory.py:retarget")
 def retarget(
     result: Path,
     /,
@@ -20,15 +35,15 @@ def retarget(
     arm: Arms | None = None,
     rate_hz: RobotHz = 100.0,
     interval: Interval | None = None,
-    phase: Phase | None = None,
+    phase: PhaseName | None = None,
     view: bool = True,
     report: bool = True,
     force: Force = False,
     task: Annotated[Literal["both", "position", "orientation"], MORE] = "both",
     scale: Annotated[Factor | None, MORE] = None,
     smoothing_hz: Annotated[Hz, MORE] = 6.0,
-    speed_scale: Annotated[Share, MORE] = 0.9,
-    limit_margin: Annotated[Radians, MORE] = 0.05,
+    speed_scale: Annotated[Share | None, MORE] = None,
+    limit_margin: Annotated[Radians | None, MORE] = None,
 ) -> Outcome:  # of what summary.json holds
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
@@ -44,29 +59,12 @@ def retarget(
     ----------
     result
         Folder that `wepose track` wrote.
-    robot
-        Move this robot: one of the names above, a URDF with a robot map beside it, or the robot map itself.
     out
         Write trajectory.parquet and .csv, joint_trajectory.json, summary.json, view.html, report.html to this folder.
-    arm
-        Move only this arm of the robot, or both. Without it all arms that the robot has.
-    rate_hz
-        Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
     view
         Write view.html, the animation of the robot beside the person.
     report
         Write report.html, which shows the errors of the hands with their causes, distances and joint limits.
-    task
-        Follow the position of the person's hands, their orientation, or both.
-    scale
-        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to
-        the length of the person's (docs/retargeting.md).
-    smoothing_hz
-        Low-pass filter the person's motion at this frequency; 0 does not filter it.
-    speed_scale
-        Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
-    limit_margin
-        Keep this distance from the position limits, in radians; of a prismatic joint a tenth of it, in metres.
     """
     options = dict(locals())
     import json

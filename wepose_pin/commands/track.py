@@ -8,23 +8,24 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ..diagnostics import from_json
-from .options import MORE, RESEARCH, AcceptFailed, Force, Gaps, MethodOption, Model, Out, Subject
+from .options import MORE, RESEARCH, Force, Method, Model, Out, Subject, described_by
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 
+@described_by("tracking/__init__.py:track", "readers/__init__.py:load_session")
 def track(
     session: Path,
     /,
     *,
     out: Out,
     subject: Subject | None = None,
-    method: MethodOption | None = None,
+    method: Method | None = None,
     model: Model | None = None,
-    gaps: Gaps = False,
+    gaps: bool = False,
     view: bool = True,
     report: bool = True,
     force: Force = False,
-    accept_failed: Annotated[AcceptFailed, MORE] = False,
+    accept_failed: Annotated[bool, MORE] = False,
     covariance: Annotated[bool, MORE] = False,
     torques: Annotated[bool, MORE] = False,
     causal: Annotated[bool, RESEARCH] = False,
@@ -51,13 +52,7 @@ def track(
         Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; of a
         mechanism joints.parquet too.
     subject
-        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it;
-        or the lengths in an Xsens .mvnx. Without it lengths are those of the population prior, and mounts those that
-        the session states.
-    model
-        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
-        whole_body (docs/models.md). A URDF without such a TOML, as a robot's, is a mechanism: its sensors are named by
-        its links. Without it the body that the session names, else the upper body.
+        SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it, or the lengths in an Xsens .mvnx.
     view
         Write view.html, the animation of the motion.
     report
@@ -67,13 +62,6 @@ def track(
     torques
         Write torques.parquet too: joint torques by inverse dynamics. Assumed are a fixed base, gravity as the only
         external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
-    causal
-        Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
-    open_loop
-        Correct no headings: neither by joint accelerations, by elbows as hinges and by joined hands, nor by the resets
-        of a live session. Orientations are those of the filter from the start pose on.
-    limits
-        Keep joints with one or two axes within the limits of the model.
     """
     options = dict(locals())
     from ..body.subject import parse_subject

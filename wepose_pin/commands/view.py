@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 from ..errors import BadOption, MissingFile
-from .options import MORE, Force, Interval, OutFile, Phase
+from .options import MORE, Force, Interval, OutFile, PhaseName, described_by
 from .output import progress_bar, say
 
 
+@described_by("writers/export.py:export")
 def view(
     result: Path,
     /,
@@ -18,7 +19,7 @@ def view(
     open: bool = True,
     force: Force = False,
     interval: Annotated[Interval | None, MORE] = None,
-    phase: Annotated[Phase | None, MORE] = None,
+    phase: Annotated[PhaseName | None, MORE] = None,
 ) -> Path:
     """Show the motion of a result as one HTML page that opens offline.
 

@@ -116,11 +116,15 @@ def evaluate(
 
     Parameters
     ----------
-    pose : what `track` or `load_result` gives, or its `pose`
-    truth : the reference; where it is NaN, or has no sample near a time of the pose, that time is left out
-    interval : from, to [s]; None: all of the time that both have
-    table : of the body: it names the limbs, for errors of a hand relative to the shoulders. None: that of `pose`, where
-        it has a body, else the upper body's
+    pose : TrackResult or Pose
+        What `track` or `load_result` gives, or its `pose`.
+    truth : TrackResult or Pose
+        The reference; where it is NaN, or has no sample near a time of the pose, that time is left out.
+    interval : (float, float), optional
+        Use only this time of the recording, from and to in seconds.
+    table : BodyTable, optional
+        Of the body: it names the limbs, for errors of a hand relative to the shoulders. Without it that of `pose`,
+        where it has a body, else the upper body's.
 
     Returns
     -------

@@ -20,8 +20,8 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     path : str or Path
         The session file, or its folder; a file of `wepose live --record`.
     gaps : bool
-        Accept gaps, samples lost for longer than 50 ms: they are interpolated, and marked in the sensor's `gap`. False:
-        a gap is an error. A live recording may always have them.
+        Accept gaps of more than 50 ms: interpolate them, and mark them as `gap` in the recording and the pose. Without
+        it such a gap is an error, except in a live recording.
 
     Returns
     -------

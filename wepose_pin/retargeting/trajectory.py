@@ -145,21 +145,36 @@ def retarget(
 
     Parameters
     ----------
-    pose : what `track` or `load_result` gives, or its `pose`; or a result folder
-    robot : a name such as "panda", a URDF with a map beside it, or the map; or what `wepose_pin.retargeting.load_robot`
-        gives, with its own arms and margins
-    arm : only this arm of the robot, "left" or "right", or "both"; None: all that it has
-    task : follow the "position" of the hands, their "orientation", or "both"
-    rate_hz : samples a second of the trajectory, 10 to 2000 Hz
-    scale : factor on the way from shoulder to hand; None: the reach of the robot's arm over the length of the person's
-    smoothing_hz : cut-off frequency of the person's motion; 0: not filtered
-    speed_scale : share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1; None: 0.9
-    limit_margin : distance [rad] kept from the position limits; of a joint that slides a tenth of it [m]; None: 0.05
-    interval, phase : follow only this interval, from and to [s], or this phase of the recording; of a phase with
-        several intervals "NAME:2" is the second
-    params : weights and gains of the controller; None: the default ones
-    table : of the person's body; None: that of `pose`, where it has a body, else the upper body's
-    progress : called with the current stage (`STAGES`) and the fraction of it that is done
+    pose : TrackResult, Pose, str or Path
+        What `track` or `load_result` gives, or its `pose`; or a result folder.
+    robot : str, Path or Robot (of `wepose_pin.retargeting.load_robot`, with its own arms and margins)
+        Move this robot: a name such as panda, a URDF with a robot map beside it, or the robot map itself.
+    arm : "left", "right" or "both", optional
+        Move only this arm of the robot, or both. Without it all arms that the robot has.
+    task : "both", "position" or "orientation"
+        Follow the position of the person's hands, their orientation, or both.
+    rate_hz : float
+        Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
+    scale : float, optional
+        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to
+        the length of the person's (docs/retargeting.md).
+    smoothing_hz : float
+        Low-pass filter the person's motion at this frequency; 0 does not filter it.
+    speed_scale : float, optional
+        Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1. Without it 0.9.
+    limit_margin : float, optional
+        Keep this distance from the position limits, in radians; of a prismatic joint a tenth of it, in metres. Without
+        it 0.05.
+    interval : (float, float), optional
+        Use only this time of the recording, from and to in seconds.
+    phase : str, optional
+        Use only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+    params : ControllerParams, optional
+        Weights and gains of the controller.
+    table : BodyTable, optional
+        Of the person's body. Without it that of `pose`, where it has a body, else the upper body's.
+    progress : function, optional
+        Called with the current stage (`STAGES`) and the fraction of it that is done.
 
     Returns
     -------

@@ -59,26 +59,28 @@ def track(
     recording : Recording
         As `load_session` reads it, or built in code.
     subject : Subject or Calibration, optional
-        Lengths and mounts; None: the mean lengths of the population, or of a chosen model its own, and the mounts that
-        the session states.
+        Use the lengths and mounts of this person. Without it lengths are those of the population prior, or of a chosen
+        model its own, and mounts those that the session states.
     method : str
-        The orientation filter: "amekf", "smoother", "smekf", "smekf_published", "ncf" or "gdc", as in
-        `estimate_orientation`.
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
+        and backward in time, not live), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases,
+        with an exact covariance and two more conditions of the static test), smekf_published (the same as published),
+        ncf (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011).
     model : BodyModel, str or Path, optional
-        A body; or its file, as for `load_model`, or the URDF of a mechanism whose links carry the sensors; or the name
-        of a body of the package. None: the one that the recording names, else the upper body. It is scaled to the
-        subject's lengths.
+        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
+        whole_body (docs/models.md). A URDF without such a TOML, as a robot's, is a mechanism: its sensors are named by
+        its links. Without it the body that the session names, else the upper body.
     static_test : StaticTest, optional
         When a sensor counts as static; None: the default values.
     open_loop : bool
-        Do not correct heading drift, neither by joint accelerations, hinges and joined hands, nor by the resets of a
-        live session: orientations are the filter's from the start pose on.
+        Correct no headings: neither by joint accelerations, by elbows as hinges and by joined hands, nor by the resets
+        of a live session. Orientations are those of the filter from the start pose on.
     causal : bool
-        Begin at the end of the start pose and use no later samples, as a live session does.
+        Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
     limits : bool
-        Keep joints of one axis, such as those of a mechanism, within the limits that the model states.
+        Keep joints with one or two axes within the limits of the model.
     accept_failed : bool
-        Use the subject even if its calibration failed.
+        Use a subject even if its calibration failed, which is else refused.
 
     Returns
     -------

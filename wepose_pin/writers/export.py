@@ -146,23 +146,27 @@ def export(
     file : str or Path
         The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
-        One of `list_formats`, to which plug-ins add. Of a person: "csv", "parquet", "mot", "sto", "placement", "scale",
-        "trc", "c3d", "bvh". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix.
+        Write this format instead of that of the suffix. Of a person: csv, parquet (pose and joint angles), mot (joint
+        angles for OpenSim), sto (orientations for OpenSense), placement (of OpenSim's IMU Placer), scale (of OpenSim's
+        Scale Tool, .xml), trc, c3d, bvh. Of a person or a robot: rosbag (for ROS 2, in a folder), mcap, rrd (for
+        rerun), urdf. Of robots: lerobot (a data set of episodes, in a folder; joints in rad). Plug-ins may add others.
     names : "isb" or "opensim", optional
-        Of a .mot: only the angles of the ISB, or only the coordinates of OpenSim's model; None: both.
+        Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
+        coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.
     rate_hz : float, optional
-        Resample the motion to so many samples a second first.
-    interval, phase : optional
-        Write only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
-        "NAME:2" is the second.
+        Resample the motion at this rate.
+    interval : (float, float), optional
+        Use only this time of the recording, from and to in seconds.
+    phase : str, optional
+        Use only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     episodes : str, optional
-        Of "lerobot": "repetitions" makes each repetition of the movement an episode, a phase each of its intervals;
-        None: each result is one.
+        Only for lerobot: make each interval of this phase of the recording an episode, or, by the word repetitions,
+        each repetition of the movement. Without it each result is an episode.
     instruction : str, optional
-        Of "lerobot": what the robot does, in all episodes; None: "follow NAME".
+        Only for lerobot: say what the robot does by this text. Without it "follow", and the name of the recording.
     osim_model : str or Path, optional
-        Of "sto": the name of the subject's model, for which OpenSense's set-up files are written beside it. Of "scale":
-        that of the generic model; None: "Rajagopal_2015.osim".
+        Only for .sto and scale: name this model in the set-up files that are written, with .sto those of OpenSim's IMU
+        Placer and IMU Inverse Kinematics. Without it scale names Rajagopal_2015.osim.
     force : bool
         Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
