@@ -89,7 +89,6 @@ def test_a_tracker_is_answered_and_its_rotation_comes_on_the_segment_that_it_sit
     assert bytes.fromhex("0000000f 01 01") in answers  # without a number
     assert ping in answers
     assert bytes.fromhex("00000001 0000000000000000") in answers  # a heartbeat
-    assert source.batteries == {"right_upper_arm": pytest.approx(0.75)}
     assert source.orientations["right_upper_arm"] is False
     assert source.problems == {"SlimeVR packets that came twice or too late": 1, "damaged SlimeVR packets": 1}
 

@@ -34,15 +34,14 @@ def sender() -> Iterator[socket.socket]:
         yield sender
 
 
-def test_a_json_line_of_one_sample_may_say_the_charge_of_the_battery(source: UdpSource, sender: socket.socket) -> None:
+def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> None:
     before = time.monotonic()
-    for line in (GOOD, GOOD | {"t": 12.355, "battery": 0.4}, GOOD | {"t": 12.365}):
+    for line in (GOOD, GOOD | {"t": 12.355}, GOOD | {"t": 12.365}):
         sender.sendto(json.dumps(line).encode(), source.address)
     samples = collect(source, 3)["torso"]
     np.testing.assert_array_equal(samples.gyro_S, [GOOD["gyro"]] * 3)
     np.testing.assert_array_equal(samples.accel_S, [GOOD["accel"]] * 3)
     assert before - 0.1 < samples.time[0] < samples.time[2] < source.clock() + 1.0
-    assert source.batteries == {"torso": 0.4}
     assert source.problems == {}
 
 
@@ -94,8 +93,6 @@ def test_many_lines_and_lists_of_samples(source: UdpSource, sender: socket.socke
                 {"t": [1.0, 2.0]},
                 {"t": [], "gyro": [], "accel": []},
                 {"gyro": [0, 0]},
-                {"battery": "full"},
-                {"battery": 40},
             )
         ),
         (json.dumps({**GOOD, "sensor": "trunk"}).encode(), "samples of an unknown sensor: 'trunk'"),

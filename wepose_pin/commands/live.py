@@ -269,8 +269,8 @@ def _print_end(ended: Live, record: Path | None) -> None:
         p50, p99 = (1e3 * np.quantile(session.latency, (0.5, 0.99))).tolist()
         latency = f"from the newest sample to its pose {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
         title = f"{session.poses} poses in {session.seconds:.1f} s; {latency}"
-    titles = ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off")
-    keys = ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
+    titles = ("sensor", "samples", "ticks without", "late", "twice", "unsound", "frozen", "cut off")
+    keys = ("taken", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
     print_table(title, titles, [(name, *(str(each[key]) for key in keys)) for name, each in session.counts.items()])
     if robot is not None:
         posed, name = robot.states.total(), robot.robot.map.name

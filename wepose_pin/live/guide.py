@@ -36,7 +36,7 @@ from ..simulation import simulate
 from ..writers.live_log import LiveLog
 from .setup import AssignedSource, SensorSetup, write_segments
 from .sources.base import Source
-from .state import Action, GuideStep, GuideView, LivePose, Output, Stage, Status, StreamInfo, join_names
+from .state import Action, GuideStep, GuideView, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
 from .ticks import SensorMonitor, TickStream
 
 STATURE = "stature"  # that may be measured in place of a length
@@ -197,7 +197,7 @@ class Guide(Stage):
 
     def process(self, samples: list[Samples]) -> None:
         self.now, self.samples, self.ticks = self.source.clock(), samples, []
-        self.monitor.push(samples, self.source.orientations)
+        self.monitor.push(samples)
         if self.attempt is not None:
             self._postponed += samples
             if self.step.records:
@@ -280,10 +280,10 @@ class Guide(Stage):
 
     def build_status(self) -> Status:
         sensors = []
-        for name, known in sorted(self.monitor.update(self.now).items()):
+        for name, rate_hz in sorted(self.monitor.update(self.now).items()):
             segment = self.segments.get(name, name)
             label = name if segment == name else f"{segment} ({name})"
-            sensors.append(known._replace(segment=label, lost=name in self.silent))
+            sensors.append(SensorStatus(label, rate_hz, name in self.silent))
         status = Status("waiting", "The subject is saved. Tracking begins.", 0.0, self.now, tuple(sensors))
         status = status._replace(problems=dict(self.source.problems))
         if self.is_over:

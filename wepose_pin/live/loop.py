@@ -27,7 +27,7 @@ from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
 from ..readers.live_log import LONGEST_TEXT, build_recording
 from ..recording import ImuSensor, Recording
-from ..recording.arrivals import COUNTS, CUT_OFF, LATE, Samples, Ticks
+from ..recording.arrivals import COUNTS, CUT_OFF, MISSING, Samples, Ticks
 from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker, TrackOptions
 from ..tracking.heading_problem import CAUSAL_KNOT_S
@@ -58,7 +58,7 @@ class SessionSummary(NamedTuple):
 
     poses: int = 0
     seconds: float = 0.0  # [s] from the first pose to the last, on the source's clock
-    counts: Mapping[str, Mapping[str, int]] = {}  # segment → each of `arrivals.COUNTS`, and "lost" samples
+    counts: Mapping[str, Mapping[str, int]] = {}  # segment → each of `arrivals.COUNTS`
     latency: np.ndarray = np.empty(0)  # (n,) [s] of the newest ticks with a sample, from its time to its pose
     diagnostics: tuple[Diagnostic, ...] = ()
     problem: str = ""  # of the recording; empty where it is complete
@@ -144,9 +144,8 @@ class LiveLoop(Stage):
             finally:
                 for output in self.outputs:
                     output.close()
-        counts = {}
-        for name, row in zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True):
-            counts[name] = dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.missing[name]}
+        rows = zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True)
+        counts = {name: dict(zip(COUNTS, row, strict=True)) for name, row in rows}
         return SessionSummary(
             self._poses,
             self._last_pose - self._first_pose,
@@ -161,7 +160,7 @@ class LiveLoop(Stage):
 
     def process(self, samples: list[Samples]) -> None:
         pose = None
-        self._monitor.push(samples, self.source.sensors if self._estimator else self.source.orientations)
+        self._monitor.push(samples)
         for ticks in self._stream.push(samples):
             pose = self._track(ticks) or pose
         self.log.flush_if_due()  # before it is shown: a pose that others know is in the file soon
@@ -214,7 +213,7 @@ class LiveLoop(Stage):
         self._tracker.push(recording)
         estimator = self._tracker.segment_estimator
         assert estimator is not None
-        self._search.ticks = []
+        self._search.ticks, self._monitor.keeps_samples = [], False
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])
         self.log.event("start", begin=begin, end=end)
@@ -265,16 +264,16 @@ class LiveLoop(Stage):
     def build_status(self) -> Status:
         sensors, estimator, clock = self.source.sensors, self._estimator, self._stream.clock
         now, counts, frozen = self.source.clock(), clock.counts, clock.frozen.copy()
-        known = self._monitor.update(now)
+        rates = self._monitor.update(now)
         lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen | clock.lost
         problems, statuses = dict(self.source.problems), []
         for i, name in enumerate(sensors):
-            status = known.get(name, SensorStatus(name))._replace(lost=bool(lost[i]), frozen=bool(frozen[i]))
-            missing = status.missing + int(counts[i, LATE])
-            status = status._replace(missing=missing, heading_std=float(self._heading_std[i]))
+            status = SensorStatus(name, rates.get(name, 0.0), bool(lost[i]), frozen=bool(frozen[i]))
+            if self._stream.has_begun:
+                status = status._replace(missing=int(counts[i, MISSING]))
             if estimator is not None:
-                bias = tuple(estimator.gyro_bias[i].tolist())
-                status = status._replace(static=bool(estimator.static[i]), gyro_bias=bias)
+                static, bias = bool(estimator.static[i]), tuple(estimator.gyro_bias[i].tolist())
+                status = status._replace(static=static, gyro_bias=bias, heading_std=float(self._heading_std[i]))
             statuses.append(status)
             if counts[i, CUT_OFF]:
                 problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = int(counts[i, CUT_OFF])

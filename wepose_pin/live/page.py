@@ -4,8 +4,7 @@ meshcat's own server listens on every interface and queues what a slow browser h
 meshcat's viewer inside and gets frames through ``/stream``, a WebSocket of ours, little endian. The browser answers
 each message with the text ``taken`` when it is drawn; until then no other comes, and then the newest.
 
-- Text: ``{"id": …}`` once (another id means another page to load); then each `state.Status` as JSON, and under
-  ``angles`` the joint angles [deg] since the status before, with their times.
+- Text: ``{"id": …}`` once (another id means another page to load); then each `state.Status` as JSON.
 - Binary: time (float64, NaN before the start); for each link its rotation row by row and its position [m] (12 float32);
   the points whose paths are drawn (3 float32 each); for each link whether its sensor is lost (1 byte). The names of the
   links are in the page; those of a robot come last.
@@ -36,11 +35,10 @@ from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from ..angles import joint_angles
 from ..body import BodyModel
-from ..body.kinematics import KinematicsSolver, Pose
+from ..body.kinematics import KinematicsSolver
 from ..body.links import find_known_links, find_known_points
-from ..errors import BadOption, WeposeError
+from ..errors import BadOption
 from ..report.viewer import DARK, LIGHT, Mesh, backdrop, choose_trail_colour, filled, find_floor, scene, view, visible
 from ..retargeting.placement import place_beside_person
 from ..retargeting.robot import Robot
@@ -49,8 +47,6 @@ from ..retargeting.visuals import build_parts
 from .sources.udp import LOOPBACK, name_host
 from .state import QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
 
-CURVE_RATE_HZ = 20.0  # of joint angles
-MAX_CURVE_POSES = 200  # that wait for a browser
 FINGERS = 0.1  # [m] beyond the end of a limb
 DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.6, 0.8]])
 MAX_REQUESTS = 16  # not yet taken; more are dropped
@@ -118,7 +114,7 @@ class LivePage(Output):
         self.encoder.start(info)
 
     def show(self, pose: LivePose) -> None:
-        self.encoder.show(pose)  # it is drawn when a browser is ready for it
+        self.encoder.newest = pose  # it is drawn when a browser is ready for it
 
     def status(self, status: Status) -> None:
         self.newest_status = status
@@ -172,10 +168,9 @@ class LivePage(Output):
                 client.send(frame)
 
     def _encode_status(self, status: Status) -> str:
-        """A status and the joint angles since the one before as JSON: its fields, null for what is not known."""
+        """A status as JSON: its fields, null for what is not known."""
         if self._encoded[0] is not status:
-            fields = _to_json(status) | {"angles": self.encoder.take_angles()}
-            self._encoded = status, json.dumps(fields, allow_nan=False)
+            self._encoded = status, json.dumps(_to_json(status), allow_nan=False)
         return self._encoded[1]
 
 
@@ -217,7 +212,6 @@ class PoseEncoder:
         data = place_n_pose(model)
         self._neutral = _stack([data.oMf[frame] for frame in self._frames])
         self._known = np.ones(len(self._frames), dtype=bool)
-        self._curve_poses, self._curve_due = deque[LivePose](maxlen=MAX_CURVE_POSES), -math.inf
 
     def start(self, info: StreamInfo) -> None:
         model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
@@ -235,14 +229,6 @@ class PoseEncoder:
             self._sensors = np.array(sensors, dtype=int)
             self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.draw.paths]
             self.newest, self.info = None, info  # the newest one may be of another stream
-            self._curve_poses.clear()
-
-    def show(self, pose: LivePose) -> None:
-        """Take the newest pose, also for the joint angles unless it is within a step of `CURVE_RATE_HZ`."""
-        self.newest = pose
-        if pose.time >= self._curve_due:
-            self._curve_due = pose.time + 1.0 / CURVE_RATE_HZ
-            self._curve_poses.append(pose)
 
     def encode(self, pose: LivePose | None) -> bytes:
         """The frame of a pose, None: the N-pose, as `page` describes it; NaN is what is not known."""
@@ -259,23 +245,6 @@ class PoseEncoder:
         if self.robot is not None:
             placements = np.concatenate([placements, self.robot.place()])
         return np.array(time, "<f8").tobytes() + placements.tobytes() + points.tobytes() + lost.tobytes()
-
-    def take_angles(self) -> dict[str, Any] | None:
-        """Times [s], and joint → angle → values [deg], of the poses since the last call; None: there are none."""
-        poses = [self._curve_poses.popleft() for _ in range(len(self._curve_poses))]
-        if not poses or self.info is None:
-            return None
-        time = np.array([pose.time for pose in poses])
-        quat_WL = {name: np.array([pose.quat_WL[k] for pose in poses]) for k, name in enumerate(self.info.segments)}
-        try:
-            joints = joint_angles(Pose(time, quat_WL, {})).joints
-        except WeposeError:  # no two segments make a joint
-            return None
-        curves: dict[str, dict[str, Any]] = {name: {} for name in joints}
-        for name, joint in joints.items():
-            for angle, values in zip(joint.names, np.degrees(joint.values).T, strict=True):
-                curves[name][angle] = [round_finite(value, 1) for value in values]
-        return {"time": np.round(time, 3).tolist(), "joints": curves}
 
 
 def place_n_pose(model: BodyModel) -> pin.Data:

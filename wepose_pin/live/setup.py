@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -143,7 +142,6 @@ class AssignedSource(Source):
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         samples = self.source.read(timeout_s)
-        self.batteries = {own: self.source.batteries.get(name, math.nan) for name, own in self.segments.items()}
         return None if samples is None else self.rename(samples)
 
     def rename(self, samples: Iterable[Samples]) -> list[Samples]:

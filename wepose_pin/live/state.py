@@ -46,9 +46,8 @@ class SensorStatus(NamedTuple):
     static: bool = False
     gyro_bias: tuple[float, ...] = (math.nan, math.nan, math.nan)  # [rad/s]
     heading_std: float = math.nan  # [rad]; NaN where the filter has no covariance
-    missing: int = 0  # samples that never came, or after their tick
+    missing: int | None = None  # ticks without its value; None before ticks are made
     frozen: bool = False  # its values repeat bit for bit, though it has noise
-    battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
 
 
 class Action(NamedTuple):

@@ -1,10 +1,10 @@
-"""Samples as they come: rate, losses and unit of each sensor; ticks of one clock; the start pose in the ticks."""
+"""Samples as they come: rate and unit of each sensor; ticks of one clock; the start pose in the ticks."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -19,13 +19,10 @@ from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
 from .sources.base import Source
-from .state import SensorStatus, join_names
+from .state import join_names
 
-UNIT_WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
-FIRST_SAMPLES = 50  # by which a sensor's step is measured
-OVERTAKEN_S = 0.5  # [s] after which a sample that has not come counts as missing
+WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
 SILENT_STEP_S = 0.25  # [s] a longer step is a silence
-JUMP_S = 60.0  # [s] between two samples, from which on the clock was set
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate of the ticks is measured if the source does not know it
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
@@ -46,67 +43,66 @@ def measure_step(time_s: np.ndarray) -> float:
 
 
 class SensorMonitor:
-    """Rate, losses and unit of each sensor that has sent something."""
+    """Rate and unit of each sensor that has sent something."""
 
     def __init__(self, source: Source) -> None:
         self.wrong_unit = ""  # a sentence on sensors whose rates contradict gravity; empty: there is none
         self.sending: dict[str, float] = {}  # sensor that has sent something → time [s] of its newest sample
-        self.missing = Counter[str]()  # samples that never came
+        self.keeps_samples = True  # of the last `WINDOW_S`, for `collect` and to find a wrong unit
         self._source = source
         self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
-        self._times: dict[str, list[np.ndarray]] = {}  # of samples since the last one that was counted, or a second
-        self._steps: dict[str, float] = {}  # sensor → [s] between two samples
-        self._counted: dict[str, float] = {}  # sensor → time [s] of the sample up to which missing ones are counted
-        self._recent: dict[str, list[Samples]] = {}  # of which rates are compared with gravity
+        self._counts = Counter[str]()  # samples so far
+        self._history: dict[str, deque[tuple[float, int]]] = {}  # time [s] and count of the samples of the last second
+        self._recent: dict[str, list[Samples]] = {}
 
-    def push(self, samples: Iterable[Samples], unchecked: Collection[str] = ()) -> None:
-        """Take samples in their order of arrival; the unit of those of the `unchecked` sensors is not watched."""
-        for chunk in (each for each in samples if len(each.time)):
-            self._times.setdefault(chunk.sensor, []).append(chunk.time)
-            self._arrived[chunk.sensor] = self._source.clock()
-            self.sending[chunk.sensor] = float(chunk.time[-1])
-            if chunk.sensor in unchecked:
-                self._recent.pop(chunk.sensor, None)
-            else:
+    def push(self, samples: Iterable[Samples]) -> None:
+        """Take samples in their order of arrival."""
+        for chunk in samples:
+            time_s = chunk.time[np.isfinite(chunk.time)]
+            if not len(time_s):
+                continue
+            first, newest = float(time_s[0]), float(time_s[-1])
+            self._arrived[chunk.sensor], self.sending[chunk.sensor] = self._source.clock(), newest
+            history = self._history.setdefault(chunk.sensor, deque())
+            if not history or abs(first - history[-1][0]) > 1.0:  # a silence, or a clock that was set
+                history.clear()
+                history.append((first, self._counts[chunk.sensor] + 1))
+            self._counts[chunk.sensor] += len(time_s)
+            history.append((max(newest, history[-1][0]), self._counts[chunk.sensor]))
+            while len(history) > 2 and history[1][0] <= newest - 1.0:
+                history.popleft()
+            if self.keeps_samples:
                 self._recent.setdefault(chunk.sensor, []).append(chunk)
 
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
         """The sensors without a sample for longer than `silence_s` [s]."""
         return [name for name in sensors if now - self.sending.get(name, -math.inf) > silence_s]
 
-    def update(self, now: float) -> dict[str, SensorStatus]:
-        """Rate over each sensor's last second, missing samples and battery; looks for a wrong unit as well."""
-        self.wrong_unit, statuses = self._find_wrong_unit(), {}
-        for name, parts in self._times.items():
-            time_s = np.concatenate(parts)
-            newest = next((t for t in time_s[::-1].tolist() if math.isfinite(t)), math.nan)
-            counted = self._counted.setdefault(name, newest)
-            time_s = np.unique(time_s[(time_s >= min(newest - 1.0, counted)) & (time_s < newest + 1.0)])
-            parts[:] = [time_s]
-            if name not in self._steps and len(time_s) >= FIRST_SAMPLES:
-                self._steps[name] = measure_step(time_s)
-            done = time_s[1:] <= newest - OVERTAKEN_S
-            if step := self._steps.get(name, 0.0):
-                steps = np.diff(time_s)[done & (time_s[1:] > counted)]
-                self.missing[name] += int(np.rint(steps[(steps > 1.5 * step) & (steps < JUMP_S)] / step - 1.0).sum())
-            self._counted[name] = float(time_s[1:][done][-1]) if done.any() else counted
-            rate_hz = float(np.count_nonzero(time_s > newest - 1.0)) if now - self._arrived[name] < 1.0 else 0.0
-            battery = self._source.batteries.get(name, math.nan)
-            statuses[name] = SensorStatus(name, rate_hz, missing=self.missing[name], battery=battery)
-        return statuses
+    def collect(self, sensor: str, seconds: float) -> Samples:
+        """The samples of the newest `seconds` [s]."""
+        time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*self._recent[sensor], strict=True))[1:])
+        rows = (time_s > self.sending[sensor] - seconds) & (time_s <= self.sending[sensor])
+        return Samples(sensor, time_s[rows], gyro_S[rows], accel_S[rows])
+
+    def update(self, now: float) -> dict[str, float]:
+        """Sensor → samples a second over the last second, on the source's clock; looks for a wrong unit as well."""
+        self.wrong_unit = self._find_wrong_unit() if self.keeps_samples else ""
+        rates = {}
+        for name, history in self._history.items():
+            (first, before), (last, count) = history[0], history[-1]
+            rates[name] = (count - before) / (last - first) if now - self._arrived[name] < 1.0 and last > first else 0.0
+        return rates
 
     def _find_wrong_unit(self) -> str:
         rates = {}
-        for sensor, recent in self._recent.items():
-            time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*recent, strict=True))[1:])
-            newest = float(np.max(time_s, where=np.isfinite(time_s), initial=-np.inf))
-            rows = time_s > newest - UNIT_WINDOW_S
-            recent[:] = [Samples(sensor, time_s[rows], gyro_S[rows], accel_S[rows])]
-            span_s = newest - float(np.min(time_s, where=rows, initial=newest))
-            if span_s > 0.9 * UNIT_WINDOW_S:
-                rate = find_unseen_rate(gyro_S[rows], accel_S[rows], (np.count_nonzero(rows) - 1) / span_s)
+        for name, recent in self._recent.items():
+            recent[:] = [self.collect(name, WINDOW_S)]
+            ((_, time_s, gyro_S, accel_S),) = recent
+            span_s = float(np.ptp(time_s))
+            if span_s > 0.9 * WINDOW_S and name not in self._source.orientations:
+                rate = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / span_s)
                 if math.isfinite(rate):
-                    rates[sensor] = rate
+                    rates[name] = rate
         if not rates:
             return ""
         what = f"rates of {max(rates.values()):.2g} rad/s while gravity does not turn: deg/s?"

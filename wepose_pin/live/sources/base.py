@@ -69,7 +69,6 @@ class Source(ABC):
     begin : [s] time of the first sample of all; None where it is not known
     orientations : sensors whose samples are measured orientations (`pack_orientations`) → whether these are the
         segment's own, in one world; else they are the sensor's, in a world of its own
-    batteries : sensor → share of its charge, 0 to 1, of those that have said it
     problems : problem → count of what was dropped so far ("bad checksums": 3)
     measures_orientations : whether it has orientations in place of rates and specific forces
     """
@@ -80,7 +79,6 @@ class Source(ABC):
     def __init__(self, sensors: Iterable[str] = (), rate_hz: float | None = None) -> None:
         self.sensors, self.rate_hz = tuple(sensors), rate_hz
         self.problems: dict[str, int] = Counter()
-        self.batteries: dict[str, float] = {}
 
     @property
     def orientations(self) -> Mapping[str, bool]:
@@ -118,13 +116,14 @@ class Source(ABC):
             problem = "other problems"
         self.problems[problem] += number
 
-    def keep_plausible(self, sensor: str, time: np.ndarray, values: np.ndarray) -> list[Samples]:
-        """The plausible of these samples, times (m,) [s] and values (m, 6) [rad/s, m/s²], as one `Samples` or none."""
-        plausible = (np.abs(time) < MAX_TIME) & (np.abs(values) <= MAX_VALUES).all(axis=1)  # a NaN is neither
+    def keep_plausible(self, samples: Samples) -> list[Samples]:
+        """These samples without the implausible ones, which are counted; empty if none remains."""
+        values = np.hstack(samples[2:])
+        plausible = (np.abs(samples.time) < MAX_TIME) & (np.abs(values) <= MAX_VALUES).all(axis=1)  # a NaN is neither
         if not plausible.all():
-            self.count(IMPLAUSIBLE, len(time) - int(plausible.sum()))
-            time, values = time[plausible], values[plausible]
-        return [Samples(sensor, time, values[:, :3], values[:, 3:])] if len(time) else []
+            self.count(IMPLAUSIBLE, int(np.count_nonzero(~plausible)))
+            samples = Samples(samples.sensor, *(column[plausible] for column in samples[1:]))
+        return [samples] if len(samples.time) else []
 
 
 class HostClock:

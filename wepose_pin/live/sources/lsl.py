@@ -1,4 +1,4 @@
-"""Samples from the Lab Streaming Layer: one stream a sensor, or one for all.
+"""Samples from the Lab Streaming Layer, one stream a sensor.
 
 liblsl's dejittering is not used: it assumes that no sample is missing, and after a loss its times are wrong for long
 (liblsl 1.18, 1 s lost at 100 Hz: by −1.0 s at first, by +0.3 s 7 s later).
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -34,10 +34,12 @@ ANSWER_S = 3.0
 
 
 class Stream(NamedTuple):
-    """An inlet and its sensors."""
+    """The stream of a sensor."""
 
+    name: str
     inlet: Any
-    sensors: Mapping[str, tuple[list[int], np.ndarray]]  # sensor → its six channels, and their factors (6,) to SI
+    channels: list[int]  # the six of `SIGNALS`
+    factors: np.ndarray  # (6,) from their units to SI
     rate_hz: float
 
 
@@ -49,7 +51,7 @@ def open_spec(rest: str, options: SourceOptions) -> LslSource:
 
 
 class LslSource(Source):
-    """Streams called `name`, `name`-segment or `name`_segment, which liblsl finds again where they have a source_id.
+    """Streams called `name`-segment or `name`_segment, which liblsl finds again where they have a source_id.
 
     Times are liblsl's `local_clock`, monotonic; of another machine it corrects them for the sender's clock. `segments`
     are names that sensors may have, `sensors` those to wait for; None: all that are found.
@@ -58,7 +60,7 @@ class LslSource(Source):
     def __init__(self, name: str, segments: Sequence[str], sensors: Sequence[str] | None = None) -> None:
         super().__init__(sensors or ())
         self._name, self._segments = name, tuple(segments)
-        self._streams: dict[str, Stream] = {}
+        self._streams: dict[str, Stream] = {}  # by segment
 
     def explain_unit(self, key: str, unit: str) -> str:
         channels = SIGNALS[:3] if key == "gyro_unit" else SIGNALS[3:]
@@ -69,25 +71,24 @@ class LslSource(Source):
 
     def connect(self, timeout_s: float) -> bool:
         """Search and subscribe; raises `BadSource` where a stream has other channels than it should."""
-        query = " or ".join(f"starts-with(name,'{self._name}{end}')" for end in "-_") + f" or name='{self._name}'"
-        answers = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=max(COLLECT_S, timeout_s))
-        for info in answers:
-            if info.name() not in self._streams:
-                self._streams[info.name()] = self._subscribe(info)
-        present = [sensor for stream in self._streams.values() for sensor in stream.sensors]
-        if not present or not set(self.sensors) <= set(present):
+        query = " or ".join(f"starts-with(name,'{self._name}{end}')" for end in "-_")
+        for info in self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=max(COLLECT_S, timeout_s)):
+            segment = info.name()[len(self._name) + 1 :]
+            if segment not in self._streams:
+                self._streams[segment] = self._subscribe(info, segment)
+            elif self._streams[segment].name != info.name():
+                raise BadSource(f"lsl:{self._name}: {segment} is in two streams; stop one of them")
+        if not self._streams or not set(self.sensors) <= set(self._streams):
             return False
-        twice = {segment for segment in present if present.count(segment) > 1}
-        if twice:
-            raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
-        self.sensors = self.sensors or tuple(segment for segment in self._segments if segment in present)
+        self.sensors = self.sensors or tuple(segment for segment in self._segments if segment in self._streams)
         rates = {stream.rate_hz for stream in self._streams.values()}
         self.rate_hz = rates.pop() if len(rates) == 1 and min(rates) > 0.0 else None
         return True
 
-    def _subscribe(self, info: Any) -> Stream:
-        stream = info.name()
-        where = f"lsl:{self._name}: stream '{stream}'"
+    def _subscribe(self, info: Any, segment: str) -> Stream:
+        where = f"lsl:{self._name}: stream '{info.name()}'"
+        if segment not in self._segments:
+            raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(self._segments, segment)}")
         flags = self._lsl.proc_clocksync if os.environ.get("LSLAPICFG") else 0  # one machine has one clock
         inlet = self._lsl.StreamInlet(info, max_buflen=BUFFER_S, processing_flags=int(flags))
         try:
@@ -98,53 +99,40 @@ class LslSource(Source):
         unnamed = [None] * full.channel_count()
         labels = [label or "" for label in full.get_channel_labels() or unnamed]
         units = [unit or "" for unit in full.get_channel_units() or unnamed]
-        prefixes = {segment: f"{segment}_" for segment in self._segments}  # of the labels of each sensor
-        if stream != self._name:  # of one sensor, whose first six channels need no label where there are no others
-            segment = stream[len(self._name) + 1 :]
-            if segment not in self._segments:
-                raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(self._segments, segment)}")
-            prefixes = {segment: ""}
-            labels = labels if any(labels) or len(labels) != len(SIGNALS) else list(SIGNALS)
-        sensors = {}
-        for segment, prefix in prefixes.items():
-            if prefix and not any(label.startswith(prefix) for label in labels):
-                continue
-            factors = []
-            for label in (prefix + signal for signal in SIGNALS):
-                if label not in labels:
-                    raise BadSource(f"{where}: no channel labelled '{label}'; {one_of([*filter(None, labels)], label)}")
-                known = GYRO_UNITS if "gyr_" in label else ACCEL_UNITS | SQUARED
-                unit = units[labels.index(label)] or next(iter(known))
-                if unit not in known:
-                    raise BadSource(f"{where}: channel '{label}': unit '{unit}'; {one_of(known, unit)}")
-                factors.append(known[unit])
-            sensors[segment] = [labels.index(prefix + signal) for signal in SIGNALS], np.array(factors)
-        if not sensors:
-            raise BadSource(f"{where}: no channel label names a segment, as {self._segments[0]}_gyr_x")
-        return Stream(inlet, sensors, float(full.nominal_srate()))
+        if len(labels) == len(SIGNALS) and not any(labels):
+            labels = list(SIGNALS)
+        factors = []
+        for label in SIGNALS:
+            if label not in labels:
+                raise BadSource(f"{where}: no channel labelled '{label}'; {one_of([*filter(None, labels)], label)}")
+            known = GYRO_UNITS if label.startswith("gyr") else ACCEL_UNITS | SQUARED
+            unit = units[labels.index(label)] or next(iter(known))
+            if unit not in known:
+                raise BadSource(f"{where}: channel '{label}': unit '{unit}'; {one_of(known, unit)}")
+            factors.append(known[unit])
+        channels = [labels.index(label) for label in SIGNALS]
+        return Stream(info.name(), inlet, channels, np.array(factors), float(full.nominal_srate()))
 
     def describe_awaited(self) -> str:
-        present = {sensor for stream in self._streams.values() for sensor in stream.sensors}
-        names = [segment for segment in self.sensors if present and segment not in present]
+        names = [segment for segment in self.sensors if self._streams and segment not in self._streams]
         where = "where LSLAPICFG looks" if os.environ.get("LSLAPICFG") else "on this machine"
-        return f"the LSL stream {self._name} {where}" + (f": {join_names(names)}" if names else "")
+        return f"the LSL streams {self._name}-SEGMENT {where}" + (f": {join_names(names)}" if names else "")
 
     def read(self, timeout_s: float) -> list[Samples]:
         samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
         while True:
-            for name, stream in list(self._streams.items()):
+            for segment in [segment for segment in self.sensors if segment in self._streams]:
+                stream = self._streams[segment]
                 try:
                     rows, times = stream.inlet.pull_chunk(timeout=0.0, max_samples=MAX_SAMPLES)
                 except RuntimeError:  # pylsl's LostError is one
-                    self.count(f"streams lost for good, without a source_id: {name}")
-                    del self._streams[name]
+                    self.count(f"streams lost for good, without a source_id: {stream.name}")
+                    del self._streams[segment]
                     continue
                 if len(times):
-                    stamps, table = np.array(times), np.array(rows, dtype=float)
-                    for sensor, (channels, factors) in stream.sensors.items():
-                        if sensor in self.sensors:
-                            samples += self.keep_plausible(sensor, stamps, table[:, channels] * factors)
+                    values = np.array(rows, dtype=float)[:, stream.channels] * stream.factors
+                    samples += self.keep_plausible(Samples(segment, np.array(times), values[:, :3], values[:, 3:]))
             left = deadline - time.monotonic()
             if samples or left <= 0.0:
                 return samples

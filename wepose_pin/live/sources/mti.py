@@ -107,8 +107,7 @@ class MTiSource(Source):
         except ImportError:
             raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
         self._serial, self._devices, self._hz = serial, dict(devices), rate_hz
-        # Segment, times (m,) [s] and values (m, 6) of samples, or a problem.
-        self._inbox: SimpleQueue[tuple[str, np.ndarray, np.ndarray] | str] = SimpleQueue()
+        self._inbox: SimpleQueue[Samples | str] = SimpleQueue()  # samples, or a problem
         self._waits = dict.fromkeys(devices, "the port is being opened")  # segment → why nothing comes; empty: it does
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -133,7 +132,7 @@ class MTiSource(Source):
                 if isinstance(came, str):
                     self.count(came)
                 else:
-                    samples += self.keep_plausible(*came)
+                    samples += self.keep_plausible(came)
                 came = self._inbox.get_nowait()
         return samples
 
@@ -204,7 +203,7 @@ class MTiSource(Source):
                 self._inbox.put(f"damaged packets and errors of {segment}")
             if samples:
                 time_s, values = map(np.array, zip(*samples, strict=True))
-                self._inbox.put((segment, clock.to_host(time_s, now), values))
+                self._inbox.put(Samples(segment, clock.to_host(time_s, now), values[:, :3], values[:, 3:]))
             time.sleep(PAUSE_S)
 
 

@@ -27,9 +27,9 @@ LONGEST_STEP_S = 0.02  # [s] between orientations that came together
 HEADER = struct.Struct(">IQ")
 HANDSHAKE_ANSWER = (b"\x03Hey OVR =D 5").ljust(64, b"\0")
 HEARTBEAT = HEADER.pack(1, 0)
-HANDSHAKE, PING, BATTERY, SENSOR_INFO, ROTATION = 3, 10, 12, 15, 17
-# Packets that hold nothing for us: heartbeat, acceleration, tap, error, signal and others.
-UNUSED = frozenset({0, 2, 4, 11, 13, 14, 18, 19, 20, 21, 22, 26})
+HANDSHAKE, PING, SENSOR_INFO, ROTATION = 3, 10, 15, 17
+# Packets that hold nothing for us: heartbeat, acceleration, battery, tap, error, signal and others.
+UNUSED = frozenset({0, 2, 4, 11, 12, 13, 14, 18, 19, 20, 21, 22, 26})
 NORMAL = 1  # kind of a rotation; 2 is a correction
 ARMS = "left_forearm right_forearm left_upper_arm right_upper_arm left_hand right_hand".split()
 # Place on the body → segment.
@@ -129,10 +129,6 @@ class SlimeVrSource(DatagramSource):
                 tracker.places[data[0]] = SEGMENT_OF[data[6]]
         elif kind == PING:
             self.send(datagram, sender)
-        elif kind == BATTERY:
-            share = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
-            names = [self._find_segment(tracker, sensor) for sensor in tracker.places or (0,)]
-            self.batteries |= {name: share for name in names if name is not None}
         elif kind == ROTATION and data[1] == NORMAL:
             segment = self._find_segment(tracker, data[0])
             if segment is not None:

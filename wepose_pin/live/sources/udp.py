@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import select
 import socket
 import time
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ MAX_CLOCKS = 64  # of senders; one that opens a new socket for each datagram has
 LONGEST_NAME = 24  # letters
 UNITS = {"gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}  # key → unit → factor to SI
 SI = {"gyro_unit": "rad/s", "accel_unit": "m/s^2"}
-JSON_LINE = '{"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8], "battery": 0.9}'
+JSON_LINE = '{"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]}'
 
 
 def parse_address(text: str, option: str, example_port: int) -> tuple[str, int]:
@@ -170,7 +169,7 @@ def open_spec(rest: str, options: SourceOptions) -> UdpSource:
 
 
 class UdpSource(DatagramSource):
-    """Samples of raw sensors, in `units` (as of `decode`); other parameters and errors as `DatagramSource`.
+    """Samples of raw sensors, in `units` where a line states none; other parameters and errors as `DatagramSource`.
 
     Times of each sender, an address and port, are mapped to our clock (`HostClock`).
     """
@@ -195,74 +194,48 @@ class UdpSource(DatagramSource):
         return f'State the unit: --source udp:{at},{key}={unit}, or "{key}": "{unit}" in each line of JSON'
 
     def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
-        by_sender: dict[Any, list[Batch]] = {}  # together, since its newest sample determines its clock best
+        by_sender: dict[Any, list[Samples]] = {}  # together, since its newest sample determines its clock best
         for datagram, sender in datagrams:
-            for batch in decode(datagram, self.segments, self._units):
-                if isinstance(batch, str):
-                    self.count(batch)
-                elif not self.tracks(batch.sensor):
-                    self.count(f"samples of {batch.sensor}, which is not tracked")
+            for line in filter(bytes.strip, datagram.splitlines()):
+                try:
+                    samples = self._decode(line)
+                except ValueError as error:
+                    self.count(str(error))
                 else:
-                    by_sender.setdefault(sender, []).append(batch)
-                    if math.isfinite(batch.battery):
-                        self.batteries[batch.sensor] = batch.battery
-        samples: list[Samples] = []
-        for sender, batches in by_sender.items():
+                    by_sender.setdefault(sender, []).append(samples)
+        sound: list[Samples] = []
+        for sender, own in by_sender.items():
             if len(self._clocks) >= MAX_CLOCKS:
                 self._clocks.clear()
             clock = self._clocks.setdefault(sender, HostClock())
-            times = clock.to_host(np.concatenate([batch.time for batch in batches]), now)
-            for batch in batches:
-                own, times = times[: len(batch.time)], times[len(batch.time) :]
-                samples += self.keep_plausible(batch.sensor, own, batch.values)
-        return samples
+            times = clock.to_host(np.concatenate([each.time for each in own]), now)
+            for each in own:
+                sound += self.keep_plausible(each._replace(time=times[: len(each.time)]))
+                times = times[len(each.time) :]
+        return sound
 
-
-class Batch(NamedTuple):
-    """Samples of one sensor in a line, on the sender's clock."""
-
-    sensor: str
-    time: np.ndarray  # (m,) [s]
-    values: np.ndarray  # (m, 6) gyro [rad/s], accel [m/s²]
-    battery: float  # share of its charge, 0 to 1; NaN: not said
-
-
-def decode(
-    datagram: bytes, segments: Collection[str] | None = None, units: Mapping[str, str] = SI
-) -> Iterator[Batch | str]:
-    """Iterate over the batches in a datagram, with a problem in place of each line that is dropped; raises nothing.
-
-    `segments` are names of sensors; None: any. `units` are of lines that do not state their own.
-    """
-    for line in filter(bytes.strip, datagram.splitlines()):
+    def _decode(self, line: bytes) -> Samples:
+        """The samples in a line of JSON, in SI units, on the sender's clock; raises `ValueError` with the problem."""
         try:
-            yield _decode_line(line, segments, units)
-        except ValueError as error:
-            yield str(error)
-
-
-def _decode_line(line: bytes, segments: Collection[str] | None, units: Mapping[str, str]) -> Batch:
-    """The samples of a line of JSON; raises `ValueError` with the problem."""
-    try:
-        message = json.loads(line)
-        sensor, battery = message["sensor"], _read_numbers(message.get("battery", math.nan)).item()
-        stated = {key: str(message.get(key, unit)) for key, unit in units.items()}
-        time, gyro, accel = (_read_numbers(message[key]) for key in ("t", "gyro", "accel"))
-        if not (time.size and gyro.shape == accel.shape == (*time.shape, 3)) or battery < 0.0 or battery > 1.0:
-            raise ValueError("shapes")
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        raise ValueError(f"lines that are not as {JSON_LINE}") from None
-    is_name = isinstance(sensor, str) and 0 < len(sensor) <= LONGEST_NAME
-    if not is_name or (segments is not None and sensor not in segments):
-        raise ValueError(f"samples of an unknown sensor: {str(sensor)[:LONGEST_NAME]!r}")
-    for key, known in UNITS.items():
-        if stated[key] not in known:
-            raise ValueError(f"JSON lines with {key} {stated[key][:LONGEST_NAME]!r}; {one_of(known)}")
-    if not np.abs(time).max() < MAX_TIME:
-        raise ValueError(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
-    gyro, accel = gyro * GYRO_UNITS[stated["gyro_unit"]], accel * ACCEL_UNITS[stated["accel_unit"]]
-    values = np.concatenate([gyro, accel], axis=-1)
-    return Batch(sensor, time.reshape(-1), values.reshape(-1, 6), battery)
+            message = json.loads(line)
+            sensor, stated = message["sensor"], {key: str(message.get(key, unit)) for key, unit in self._units.items()}
+            time, gyro, accel = (_read_numbers(message[key]) for key in ("t", "gyro", "accel"))
+            if not (time.size and gyro.shape == accel.shape == (*time.shape, 3)):
+                raise ValueError("shapes")
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+            raise ValueError(f"lines that are not as {JSON_LINE}") from None
+        is_name = isinstance(sensor, str) and 0 < len(sensor) <= LONGEST_NAME
+        if not is_name or (self.segments is not None and sensor not in self.segments):
+            raise ValueError(f"samples of an unknown sensor: {str(sensor)[:LONGEST_NAME]!r}")
+        for key, known in UNITS.items():
+            if stated[key] not in known:
+                raise ValueError(f"JSON lines with {key} {stated[key][:LONGEST_NAME]!r}; {one_of(known)}")
+        if not np.abs(time).max() < MAX_TIME:
+            raise ValueError(f"samples with times over {MAX_TIME:g} s, which no clock has; t is in seconds")
+        if not self.tracks(sensor):
+            raise ValueError(f"samples of {sensor}, which is not tracked")
+        gyro, accel = gyro * GYRO_UNITS[stated["gyro_unit"]], accel * ACCEL_UNITS[stated["accel_unit"]]
+        return Samples(sensor, time.reshape(-1), gyro.reshape(-1, 3), accel.reshape(-1, 3))
 
 
 def _read_numbers(value: Any) -> np.ndarray:

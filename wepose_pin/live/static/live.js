@@ -203,7 +203,6 @@ function show(status) {
   $("say").querySelector("strong").textContent = SAYS[state] ?? state;
   $("say").querySelector("span").textContent = status.message;
   showGuide(status.guide);
-  $("curves").hidden = !begun;
   showActions();
   $("progress").querySelector("i").style.width = `${100 * status.progress}%`;
   $("progress").hidden = state === "waiting";
@@ -214,11 +213,10 @@ function show(status) {
     text(row, "td", words(sensor.segment));
     const place = text(row, "td", sensor.frozen ? "frozen" : is);
     place.prepend(shape(is));
-    if (sensor.battery !== null) text(place, "small", ` ${Math.round(100 * sensor.battery)} %`, "charge of its battery").className = sensor.battery < .15 ? "low" : "";
     text(row, "td", known(sensor.rate_hz, 0));
     text(row, "td", sensor.gyro_bias.map((axis) => known(begun ? degrees(axis) : null, 2).padStart(5, "\u2007")).join(" ")).className = "detail";
     text(row, "td", sensor.heading_std > UNKNOWN_HEADING ? "unknown" : known(degrees(sensor.heading_std), 1)).className = "detail";
-    text(row, "td", sensor.missing);
+    text(row, "td", known(sensor.missing, 0));
     return row;
   }));
   const [half, most] = status.latency_ms;
@@ -236,69 +234,6 @@ data.trails.forEach(({ name, colour }) => {
 });
 text($("legend"), "span", "sensor lost").prepend(Object.assign(document.createElement("i"), { className: "lost" }));
 
-// ---- joint angles of the last seconds
-const CURVES_S = 10, SIDE_COLOURS = Object.fromEntries(data.trails.map(({ name, colour }) => [name.split("_")[0], colour]));
-const curves = {};                                                       // joint → angle → [time, value] of each sample
-let curvesEnd = 0;
-const sideOf = (joint) => (/^(left|right)_/.exec(joint) ?? [])[1] ?? "";
-const groupOf = (joint) => joint.replace(/^(left|right)_/, "");
-function addAngles({ time, joints }) {
-  const end = time[time.length - 1];
-  if (end < curvesEnd || time[0] > curvesEnd + CURVES_S) Object.values(curves).forEach((angles) => { for (const angle in angles) angles[angle] = []; });
-  curvesEnd = end;
-  for (const [joint, angles] of Object.entries(joints)) {
-    for (const [angle, values] of Object.entries(angles)) {
-      const points = (curves[joint] ??= {})[angle] ??= [];
-      values.forEach((value, k) => points.push([time[k], value]));
-      while (points.length && points[0][0] < end - CURVES_S) points.shift();
-    }
-  }
-  const groups = [...new Set(Object.keys(curves).map(groupOf))];
-  if ($("joint").children.length !== groups.length) {
-    $("joint").replaceChildren(...groups.map((group) => Object.assign(document.createElement("option"), { value: group, textContent: words(group) })));
-    if (groups.includes("elbow")) $("joint").value = "elbow";
-  }
-  drawCurves();
-}
-function drawCurves() {
-  const canvas = $("plot"), shown = Object.keys(curves).filter((joint) => groupOf(joint) === $("joint").value);
-  if (guided || !shown.length || !canvas.clientWidth) return;
-  const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
-  canvas.width = width * scale;
-  canvas.height = height * scale;
-  const pen = canvas.getContext("2d"), ink = getComputedStyle(canvas), angles = Object.keys(curves[shown[0]]), panel = height / angles.length;
-  pen.scale(scale, scale);
-  pen.font = "11px system-ui, sans-serif";
-  angles.forEach((angle, row) => {
-    const lines = shown.map((joint) => [sideOf(joint), curves[joint][angle].filter(([, value]) => value !== null)]);
-    const values = lines.flatMap(([, points]) => points.map(([, value]) => value));
-    let low = Math.min(...values), high = Math.max(...values);
-    if (!(high - low > 20)) [low, high] = [(low + high) / 2 - 10, (low + high) / 2 + 10];
-    const y = (value) => panel * row + 18 + (panel - 24) * (high - value) / (high - low);
-    const x = (time) => 38 + (width - 40) * (1 - (curvesEnd - time) / CURVES_S);
-    pen.fillStyle = ink.color;
-    pen.fillText(words(angle), 38, panel * row + 11);
-    pen.textAlign = "right";
-    [high, low].forEach((value) => pen.fillText(`${value.toFixed(0)}°`, 34, y(value) + 4));
-    pen.textAlign = "left";
-    pen.strokeStyle = ink.borderColor;
-    pen.strokeRect(38, panel * row + 18, width - 40, panel - 24);
-    lines.forEach(([side, points]) => {
-      pen.strokeStyle = SIDE_COLOURS[side] ?? ink.color;
-      pen.lineWidth = 1.6;
-      pen.beginPath();
-      points.forEach(([time, value], k) => {
-        const jumps = k === 0 || Math.abs(value - points[k - 1][1]) > 180 || time - points[k - 1][0] > 0.5;
-        pen[jumps ? "moveTo" : "lineTo"](x(time), y(value));
-      });
-      pen.stroke();
-      pen.lineWidth = 1;
-    });
-  });
-}
-$("joint").addEventListener("change", drawCurves);
-addEventListener("resize", drawCurves);
-
 // ---- the line: nothing more comes until what came is drawn
 let socket, tries = 0, owed = 0, newestStatus = null, newestFrame = null, drawnAt = performance.now();
 function connect() {
@@ -311,7 +246,6 @@ function connect() {
     const said = JSON.parse(message);
     if (!("state" in said)) { if (said.id !== data.id) location.reload(); return; }    // another session at the same address
     newestStatus = said;
-    if (said.angles) addAngles(said.angles);
   };
   socket.onclose = () => {
     const ended = (newestStatus?.state ?? state) === "ended";
