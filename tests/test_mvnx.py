@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +9,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from commands import run
 from device_files import MVN_SEGMENTS, mvnx, turning
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin import BadData, BadSession, MissingFile, track
-from wepose_pin.writers import write_session
 
 OURS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 
@@ -117,23 +114,6 @@ def test_elbow_and_wrist_have_the_joint_angles_of_xsens(
         np.testing.assert_allclose(np.degrees(angles["right_wrist"].values), np.column_stack([z, -x, y]), atol=0.001)
 
 
-def test_a_subject_from_an_mvnx_is_a_prior_with_the_lengths_as_they_are(
-    xsens: tuple[Path, dict[str, np.ndarray], dict[str, np.ndarray]],
-    half_minute: wp.Recording,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    path, _, moving = xsens
-    write_session(tmp_path, half_minute)
-    assert run("calibrate", tmp_path, "--prior", path, "-o", tmp_path / "out", "--no-report") in (0, 3, 4)
-    printed = capsys.readouterr().out
-    for side in ("left", "right"):
-        arm = [moving[f"{side.capitalize()}{part}"] for part in ("UpperArm", "ForeArm", "Hand")]
-        for segment, upper, lower in (("upper arm", *arm[:2]), ("forearm", *arm[1:])):
-            length = 1e3 * np.median(np.linalg.norm(lower - upper, axis=1))
-            assert re.search(rf"{side} {segment} .* {length:.1f} ± 10\.0", printed), printed
-
-
 def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
     pose, _ = tracked
     recording = pose.recording
@@ -150,7 +130,6 @@ def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
 # Made files --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("version", ["2", "3", "4"])
 def made(folder: Path, path: Path, segments: tuple[str, ...]) -> wp.Recording:
     return wp.load_session(session(folder, path.name, segments))
 

@@ -65,7 +65,7 @@ def calibrate(
     measured
         May be given several times, as in biacromial=0.41.
     prior
-        SUBJECT is a subject.toml or its folder; of an Xsens .mvnx only the lengths are used.
+        SUBJECT is a subject.toml or its folder.
     report
         Write report.html, which shows the quality and what to do about it, lengths, mounts and the gap between the
         palms.
@@ -73,8 +73,8 @@ def calibrate(
     options = dict(locals())
     from .. import calibration as room
     from ..body.body import load_sensed_model
+    from ..body.subject import load_subject
     from ..readers import load_session
-    from ..readers.mvnx import read_subject
     from ..report import calibration as report_room
     from ..writers.calibration import write_calibration
     from ..writers.provenance import collect_provenance, result_folder
@@ -88,7 +88,7 @@ def calibrate(
             progress("reading", 0.0)
             recording = load_session(session, gaps=gaps)
             body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
-            earlier = None if prior is None else read_subject(prior)
+            earlier = None if prior is None else load_subject(prior)
             progress("calibrating", 1 / 3)
             calibration = room.calibrate(
                 recording,

@@ -52,16 +52,16 @@ def info(
         description = describe_file(file, session.absolute().parent, body, None if model is None else Path(model))
         if writes:
             if description.session is None:
-                raise BadOption(f"--write: there is no session to write for {description.what}")
+                raise BadOption(f"--write: there is no session to write for {file}: {description.title}")
             with whole_file(session, force) as partial:
                 partial.write_text(description.session, encoding="utf-8")
-    say(description.what)
+    say(f"{file}: {description.title}")
     for fact in description.facts:
         say(f"  {fact}")
     print_diagnostics(description.diagnostics)
-    if description.sensors:
+    if description.recording is not None:
         header = ("sensor", "in the file", "holds", "peak rate", "median specific force", "gaps over 50 ms")
-        print_table("Sensors", header, description.sensors)
+        print_table("Sensors", header, list(description.list_sensors()))
     if writes:
         then = description.then.replace("SESSION", str(session))
         check = "check the lines marked CHECK, then: " if "CHECK" in (description.session or "") else ""

@@ -52,7 +52,7 @@ def track(
         Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; of a
         mechanism joints.parquet too.
     subject
-        SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it, or the lengths in an Xsens .mvnx.
+        SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it.
     view
         Write view.html, the animation of the motion.
     report
@@ -64,10 +64,9 @@ def track(
         external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
     """
     options = dict(locals())
-    from ..body.subject import parse_subject
+    from ..body.subject import load_subject, parse_subject
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
-    from ..readers.mvnx import read_subject
     from ..report.pages import write_track_pages
     from ..tracking import CHUNK_S, SummaryAccumulator, TrackOptions, track_chunks
     from ..writers.provenance import collect_provenance, result_folder
@@ -77,7 +76,7 @@ def track(
     with progress_bar() as progress:
         with result_folder(out, force) as folder:
             progress("reading", 0.0)
-            person = None if subject is None else read_subject(subject)
+            person = None if subject is None else load_subject(subject)
             if person is not None and not accept_failed:
                 person.check_quality()
             if is_live_log(session):

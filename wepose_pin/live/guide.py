@@ -23,13 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
 from ..body.kinematics import KinematicsSolver
+from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
 from ..errors import BadOption
 from ..filters import BEST
 from ..readers import load_session
 from ..readers.live_log import Markers, build_recording
-from ..readers.mvnx import read_subject
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
 from ..simulation import simulate
@@ -84,7 +84,7 @@ class GuideOptions:
         return calibrate(
             recording,
             measured={name: value for name, value in lengths.items() if name != STATURE},
-            prior=None if self.subject is None else read_subject(self.subject),
+            prior=None if self.subject is None else load_subject(self.subject),
             stature=lengths.get(STATURE, self.stature),
             sex=self.sex,
             protocol=choose_parts(self.protocol, recording.phases),

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -23,6 +23,7 @@ from ..data_tables import read_columns, read_names, read_table
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
+from ..filters.noise import average_blocks
 from ..recording import AXES, CONFIGURATION, ImuSensor, Intervals, Recording, format_span, format_time
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs
@@ -34,8 +35,7 @@ from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .reference import read_reference
 from .registry import detect_format, look_up_format, read_device
-from .session import read_session
-from .session_file import format_keys
+from .session import format_keys, read_session
 
 # A line of a file that says its rate.
 _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,12}(?P<rate>\d+(\.\d+)?)", re.IGNORECASE)
@@ -47,15 +47,40 @@ SHORTEST_STATIC_S = 1.0
 MOST_SIBLINGS = 50
 
 
-class Description(NamedTuple):
-    """The description of a file for `wepose info`."""
+@dataclass
+class Description:
+    """What a file is; of data the session that is proposed for them."""
 
-    what: str  # one line
-    facts: tuple[str, ...] = ()  # one line each
-    sensors: tuple[tuple[str, ...], ...] = ()  # segment, its name in the file, signals, rate, time, gaps
-    session: str | None = None  # the proposed session file, for data
-    then: str = ""  # advice on that session
-    diagnostics: tuple[Diagnostic, ...] = ()
+    path: Path
+    title: str  # kind of file
+    facts: list[str] = field(default_factory=list)  # one line each
+    recording: Recording | None = None  # by the session, also by the proposed one; None: it cannot be read
+    data: dict[str, Any] = field(default_factory=dict)  # proposed keys of [data]
+    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # segment, or "?" and a name of the file → keys
+    checks: dict[str, str] = field(default_factory=dict)  # key → what the user has to check there
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # that the file states
+    session: str | None = None  # the text of the proposed session
+    then: str = ""  # advice on it
+
+    @property
+    def diagnostics(self) -> list[Diagnostic]:
+        """Those of the recording; a sensor on an unknown segment has its name in the file."""
+        listed = () if self.recording is None else self.recording.diagnostics
+        return [replace(each, place=each.place.removeprefix("?")) for each in listed]
+
+    def list_sensors(self) -> Iterator[tuple[str, ...]]:
+        """List segment, name in the file, signals, peak rate, median specific force and gaps of each sensor."""
+        for segment, sensor in self.recording.sensors.items() if self.recording is not None else ():
+            rate_hz = self.recording.rate_hz if self.recording is not None else 0.0
+            fastest = np.degrees(np.linalg.norm(compute_rate(sensor, rate_hz), axis=1).max())
+            holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
+            if isinstance(sensor, ImuSensor):
+                holds, gravity = "gyro, accel", f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
+            lost = [b - a for a, b in find_runs(sensor.gap)] if sensor.gap is not None else []
+            gaps = f"{len(lost)}, up to {max(lost) / rate_hz:.2f} s" if lost else "none"
+            unknown, own = segment.startswith("?"), self.sensors.get(segment, {})
+            label = own.get("label") or own.get("file") or (segment[1:] if unknown else "")
+            yield "?" if unknown else segment, label, holds, f"{fastest:.0f} deg/s", gravity, gaps
 
 
 def find_file(path: Path, body: BodyTable | None = None) -> Path:
@@ -91,48 +116,60 @@ def describe_file(
         raise MissingFile(f"{path}: no such file or folder")
     suffix = path.suffix.lower()
     if path.is_dir() and (path / "pose.parquet").is_file():
-        return Description(f"{path}: a result of `wepose track`", (f"look at it: wepose view {path}",))
+        return Description(path, "a result of `wepose track`", [f"look at it: wepose view {path}"])
     if suffix == ".toml":
         return _describe_toml(path)
     if suffix in (".c3d", ".trc"):
         return _describe_reference(path)
     folder, body = folder or path.absolute().parent, body or load_table()
     if format := detect_format(path):
-        return _describe_data(_propose_from_device(path, folder, format, body), model)
-    if is_array_file(path):
-        return _describe_data(_propose_from_names(path, folder, body, ArrayFile(path)), model)
-    names = read_names(path)[0] if suffix in TABLES else []
-    if len(names) <= (suffix == ".txt"):  # a text that is no table has one column
-        raise BadData(f"{path}: is nothing that is known here; docs/formats.md lists the files that are read")
-    if any(f"{point}_x" in names for point in body.points):
-        return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns")
-    return _describe_data(_propose_from_names(path, folder, body, None), model)
+        about = _propose_from_device(path, folder, format, body)
+    elif is_array_file(path):
+        about = _propose_from_names(path, folder, body, ArrayFile(path))
+    else:
+        names = read_names(path)[0] if suffix in TABLES else []
+        if len(names) <= (suffix == ".txt"):  # a text that is no table has one column
+            raise BadData(f"{path}: is nothing that is known here; docs/formats.md lists the files that are read")
+        if any(f"{point}_x" in names for point in body.points):
+            return Description(path, f"a pose, as `wepose track` writes it: {len(names)} columns")
+        about = _propose_from_names(path, folder, body, None)
+    if about.sensors:
+        _read_proposed(about, folder)
+        about.session, about.then = _format_session(about, folder, body, model), _advise(about, body)
+        if about.recording is not None:
+            about.facts += _list_facts(about.recording)
+    return about
 
 
-def _describe_data(proposal: _Proposal, model: Path | None) -> Description:
-    """Describe data by what a proposed session reads, with this session."""
-    recording = proposal.read() if proposal.sensors else None
-    about = Description(f"{proposal.path}: {proposal.title}", tuple(proposal.facts))
-    if proposal.sensors:
-        about = about._replace(session=_format_session(proposal, model, recording), then="mend what cannot be read")
-    if recording is None:
-        return about
-    # A sensor on an unknown segment has its name in the file.
-    read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
+def _read_proposed(about: Description, folder: Path) -> None:
+    """Read the recording as the session would, also sensors on unknown segments, and settle units."""
+    for _ in range(3):
+        values = {"start_pose": CONFIGURATION, "data": about.data, "sensors": about.sensors}
+        try:
+            about.recording = read_session(folder / "session.toml", True, values)
+            break
+        except WrongUnit as error:  # the reader's check of units is better than a guess from names
+            about.data[error.key] = error.unit
+            about.checks.pop(error.key, None)
+        except WeposeError as error:
+            about.facts.append(f"as the session proposes it, it cannot be read: {error}")
+            break
+
+
+def _advise(about: Description, body: BodyTable) -> str:
+    """Advise on what to do with the proposed session."""
+    if about.recording is None:
+        return "mend what cannot be read"
+    sensors = about.recording.sensors
     then = (
         "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject; "
         "or state the mounts and wepose track SESSION -o result"
     )
-    if all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in recording.sensors.values()):
+    if all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in sensors.values()):
         then = "wepose track SESSION -o result"
-    if not set(recording.sensors) <= set(proposal.body.segments):
+    if not set(sensors) <= set(body.segments):
         then = f"take the # off the lines of each sensor with ? and write its segment in place of SEGMENT; then {then}"
-    return about._replace(
-        facts=(*about.facts, *_list_facts(recording)),
-        sensors=_list_sensors(recording, proposal.sensors),
-        then=then,
-        diagnostics=tuple(read),
-    )
+    return then
 
 
 def _describe_reference(path: Path) -> Description:
@@ -143,25 +180,24 @@ def _describe_reference(path: Path) -> Description:
         facts.append(f"{name}: {', '.join(known) or 'none'}")
     facts.append(f"compare a result with it: wepose evaluate RESULT {path}")
     what = "rotations" if reference.own_frames else "markers"
-    return Description(f"{path}: {what}, a reference for `wepose evaluate`", tuple(facts))
+    return Description(path, f"{what}, a reference for `wepose evaluate`", facts)
 
 
 def _describe_toml(path: Path) -> Description:
     values = read_toml(path, "a session or a subject")
     if "data" in values or "sensors" in values:
         recording = read_session(path, gaps=True)
-        facts, rows = _list_facts(recording), _list_sensors(recording, {})
-        return Description(f"{path}: a session, '{recording.name}'", facts, rows, diagnostics=recording.diagnostics)
+        return Description(path, f"a session, '{recording.name}'", _list_facts(recording), recording)
     if isinstance(values.get("lengths"), dict):
         lengths = {name: length for name, length in values["lengths"].items() if is_number(length)}
-        facts = ("lengths [mm]: " + ", ".join(f"{name} {1e3 * length:.0f}" for name, length in lengths.items()),)
+        facts = ["lengths [mm]: " + ", ".join(f"{name} {1e3 * length:.0f}" for name, length in lengths.items())]
         mounts = ", ".join(values.get("mounts") or ())
-        facts += (f"mounts: {mounts}" if mounts else "no calibrated mounts",)
-        return Description(f"{path}: a subject, '{values.get('name', '')}'", facts)
+        facts.append(f"mounts: {mounts}" if mounts else "no calibrated mounts")
+        return Description(path, f"a subject, '{values.get('name', '')}'", facts)
     raise BadData(f"{path}: TOML, but neither a session ([data], [sensors.…]) nor a subject ([lengths])")
 
 
-def _list_facts(recording: Recording) -> tuple[str, ...]:
+def _list_facts(recording: Recording) -> list[str]:
     facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {format_span(recording.time[[0, -1]])}"]
     static = _find_static_intervals(recording)
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in static[:8]) + (" …" if len(static) > 8 else "")
@@ -169,102 +205,76 @@ def _list_facts(recording: Recording) -> tuple[str, ...]:
     for name, spans in recording.phases.items():
         listed = ", ".join(f"{format_time(a)} to {format_time(b)}" for a, b in spans)
         facts.append(f"phase {name} [s]: {listed or 'none'}")
-    return tuple(facts)
+    return facts
 
 
-def _list_sensors(recording: Recording, keys: Mapping[str, Mapping[str, Any]]) -> tuple[tuple[str, ...], ...]:
-    rows = []
-    for segment, sensor in recording.sensors.items():
-        fastest = np.degrees(np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1).max())
-        holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
+def _find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
+    """Find the intervals [s], of at least `SHORTEST_STATIC_S`, in which all sensors are static."""
+    size = max(2, round(BLOCK_S * recording.rate_hz))
+    static = np.ones(len(recording) // size, dtype=bool)
+
+    def spread(values: np.ndarray, center: np.ndarray) -> np.ndarray:
+        """Return the rms distance (blocks,) of values (n, 3) from the center (blocks, 3) of their block."""
+        off = values[: len(static) * size] - np.repeat(center, size, axis=0)
+        return np.asarray(np.sqrt(average_blocks(off**2, size).sum(axis=1)))
+
+    for sensor in recording.sensors.values():
+        rate = compute_rate(sensor, recording.rate_hz)
+        mean = average_blocks(rate, size)
+        # A bias is below the rate of a person who rotates evenly.
+        static &= np.linalg.norm(mean, axis=1) < 3.0 * STATIC_GYRO
         if isinstance(sensor, ImuSensor):
-            holds, gravity = "gyro, accel", f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
-        lost = [b - a for a, b in find_runs(sensor.gap)] if sensor.gap is not None else []
-        gaps = f"{len(lost)}, up to {max(lost) / recording.rate_hz:.2f} s" if lost else "none"
-        unknown, own = segment.startswith("?"), keys.get(segment, {})
-        label = own.get("label") or own.get("file") or (segment[1:] if unknown else "")
-        rows.append(("?" if unknown else segment, label, holds, f"{fastest:.0f} deg/s", gravity, gaps))
-    return tuple(rows)
+            static &= spread(sensor.accel_S, average_blocks(sensor.accel_S, size)) < STATIC_ACCEL
+        static &= spread(rate, mean if isinstance(sensor, ImuSensor) else np.zeros_like(mean)) < STATIC_GYRO
+        if sensor.gap is not None:
+            static &= ~sensor.gap[: len(static) * size].reshape(-1, size).any(axis=1)
+    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
+    return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
 
 
-# Sessions --------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class _Proposal:
-    """The contents of a proposed session."""
-
-    path: Path  # of the data
-    folder: Path  # of the session
-    body: BodyTable  # whose segments carry the sensors
-    title: str  # kind of file
-    data: dict[str, Any] = field(default_factory=dict)  # keys of [data]
-    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # segment, or "?" and a name of the file → keys
-    checks: dict[str, str] = field(default_factory=dict)  # key → what the user has to check there
-    facts: list[str] = field(default_factory=list)  # from the file, one line each
-    phases: Mapping[str, Intervals] = field(default_factory=dict)  # that the file states
-
-    def relative(self, path: Path) -> str:
-        """Return a path as the session names it."""
-        return Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix()
-
-    def read(self) -> Recording | None:
-        """Read the recording as a session file would, and settle units; None: the data cannot be read.
-
-        All sensors are read, also those on unknown segments.
-        """
-        for _ in range(3):
-            values = {"start_pose": CONFIGURATION, "data": self.data, "sensors": self.sensors}
-            try:
-                return read_session(self.folder / "session.toml", True, values)
-            except WrongUnit as error:  # the reader's check of units is better than a guess from names
-                self.data[error.key] = error.unit
-                self.checks.pop(error.key, None)
-            except WeposeError as error:
-                self.facts.append(f"as the session proposes it, it cannot be read: {error}")
-                break
-        return None
+def _relative(path: Path, folder: Path) -> str:
+    """Return a path as a session in a folder names it."""
+    return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
 
 
 # From files of a known format ----------------------------------------------------------------------------------------
 
 
-def _propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) -> _Proposal:
+def _propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) -> Description:
     """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
     format = look_up_format(name)
     device, lacks_rate = _read(path, name)
     signals = "gyroscope and accelerometer" if device.kind == "raw" else "orientations, no raw data"
-    proposal = _Proposal(path, folder, body, f"{format.title}, {signals}")
-    whole = len(device.sensors) > 1 or format.whole
-    if whole:
-        proposal.data["file"] = proposal.relative(path)
+    about = Description(path, f"{format.title}, {signals}")
+    if whole := len(device.sensors) > 1 or format.whole:
+        about.data["file"] = _relative(path, folder)
     else:
-        proposal.data["format"] = proposal.relative(Path(name)) if name.endswith(".toml") else name
+        about.data["format"] = _relative(Path(name), folder) if name.endswith(".toml") else name
     for file in [path] if whole else _list_siblings(path, name):
         try:
             device, lacks = _read(file, name)
         except WeposeError as error:
-            proposal.facts.append(f"{file.name} is left out, as it cannot be read: {error}")
+            about.facts.append(f"{file.name} is left out, as it cannot be read: {error}")
             continue
         lacks_rate |= lacks
         for label, sensor in device.sensors.items():
-            guesses = map(body.guess_segment, (label, file.stem) if len(device.sensors) == 1 else (label,))
-            segment: str | None = (
-                sensor.segment if sensor.segment in body.segments else next(filter(None, guesses), None)
-            )
-            where = segment if segment and segment not in proposal.sensors else f"?{label if whole else file.name}"
-            proposal.sensors[where] = {"label": label} if whole else {"file": proposal.relative(file)}
+            names = (label, file.stem) if len(device.sensors) == 1 else (label,)
+            guesses = (sensor.segment, *map(body.guess_segment, names))
+            segment = next((each for each in guesses if each in body.segments), None)
+            known = segment is not None and segment not in about.sensors
+            where = str(segment) if known else f"?{label if whole else file.name}"
+            about.sensors[where] = {"label": label} if whole else {"file": _relative(file, folder)}
     if lacks_rate:
-        proposal.data["rate_hz"] = ASSUMED_RATE_HZ
-        proposal.checks["rate_hz"] = "the file does not say its rate"
-    if not whole and len(proposal.sensors) > 1:
-        proposal.title += f", {len(proposal.sensors)} files"
+        about.data["rate_hz"] = ASSUMED_RATE_HZ
+        about.checks["rate_hz"] = "the file does not say its rate"
+    if not whole and len(about.sensors) > 1:
+        about.title += f", {len(about.sensors)} files"
     if name == "wepose_live":
         log = read_live_log(path)
-        proposal.facts.append(f"of {log.header['name']}, live by {log.header['method']}: {len(log.quat_WL)} poses")
-        proposal.facts.append(f"track it as it was: wepose track {path} -o result; to change its phases: --write")
-        proposal.phases = log.recording.phases
-    return proposal
+        about.facts.append(f"of {log.header['name']}, live by {log.header['method']}: {len(log.quat_WL)} poses")
+        about.facts.append(f"track it as it was: wepose track {path} -o result; to change its phases: --write")
+        about.phases = log.recording.phases
+    return about
 
 
 def _read(path: Path, format: str) -> tuple[Device, bool]:
@@ -285,39 +295,38 @@ def _list_siblings(path: Path, format: str) -> list[Path]:
 def _list_files_like(path: Path) -> list[Path]:
     """List the files beside one, of its suffix, or the folders beside one."""
     siblings = [path.parent / file.name for file in sorted(path.absolute().parent.iterdir())]
-    if path.is_dir():
-        return [file for file in siblings if file.is_dir()][:MOST_SIBLINGS]
-    return [file for file in siblings if file.suffix == path.suffix and file.is_file()][:MOST_SIBLINGS]
+    alike = (each for each in siblings if each.is_dir() == path.is_dir() and (each.is_dir() or each.is_file()))
+    return [each for each in alike if path.is_dir() or each.suffix == path.suffix][:MOST_SIBLINGS]
 
 
 # From names of columns or arrays -----------------------------------------------------------------------------------
 
 
-def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: ArrayFile | None) -> _Proposal:
+def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: ArrayFile | None) -> Description:
     """Propose a session for a table, or for the arrays of a file, by their names."""
     if content is None:
         names, units = read_names(path)
         guess, kind = guess_columns(names, body, units), "Parquet" if path.suffix.lower() == ".parquet" else "CSV"
-        proposal = _Proposal(path, folder, body, f"{kind} table, {len(names)} columns")
+        about = Description(path, f"{kind} table, {len(names)} columns")
     else:
         names = list(content.shapes)
         guess, kind = guess_arrays(content.shapes, body), "MATLAB" if path.suffix.lower() == ".mat" else "HDF5"
-        proposal = _Proposal(path, folder, body, f"{kind} file, {len(names)} arrays")
+        about = Description(path, f"{kind} file, {len(names)} arrays")
     if not guess.sensors:
         listed = one_of(names).removeprefix("there is: ")
-        proposal.facts.append(f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}")
-        return proposal
-    _propose_time(proposal, guess, content)
+        about.facts.append(f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}")
+        return about
+    _propose_time(about, guess, content)
     if any("gyro" in signals for signals in guess.sensors.values()):
-        proposal.data["gyro_unit"] = guess.units.get("gyro", "rad/s")
+        about.data["gyro_unit"] = guess.units.get("gyro", "rad/s")
         if "gyro" not in guess.units:
-            proposal.checks["gyro_unit"] = "neither the file nor the motion says so"
-        proposal.data["accel_unit"] = guess.units.get("accel", "m/s^2")
+            about.checks["gyro_unit"] = "neither the file nor the motion says so"
+        about.data["accel_unit"] = guess.units.get("accel", "m/s^2")
     for segment, signals in guess.sensors.items():
         keys = {signal: columns if len(columns) > 1 else columns[0] for signal, columns in signals.items()}
-        proposal.sensors[segment] = keys
+        about.sensors[segment] = keys
         if content and "orientation" in keys:
-            proposal.checks["orientation"] = "x, y, z, w? if w comes first, name its columns [1], [2], [3], [0]"
+            about.checks["orientation"] = "x, y, z, w? if w comes first, name its columns [1], [2], [3], [0]"
     # A table with one sensor, whose segment is that of the file's name, has others beside it with the same columns.
     own = body.guess_segment(path.stem) if content is None and len(guess.sensors) == 1 else None
     if own and next(iter(guess.sensors)).startswith("?"):
@@ -327,39 +336,39 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
             with contextlib.suppress(WeposeError):
                 if other and other not in files and read_names(file)[0] == names:
                     files[other] = file
-        proposal.sensors = {segment: {"file": proposal.relative(file), **keys} for segment, file in files.items()}
-        proposal.title += f", {len(files)} files" if len(files) > 1 else ""
+        about.sensors = {segment: {"file": _relative(file, folder), **keys} for segment, file in files.items()}
+        about.title += f", {len(files)} files" if len(files) > 1 else ""
     else:
-        proposal.data = {"file": proposal.relative(path), **proposal.data}
-    return proposal
+        about.data = {"file": _relative(path, folder), **about.data}
+    return about
 
 
-def _propose_time(proposal: _Proposal, guess: Guess, arrays: ArrayFile | None) -> None:
+def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) -> None:
     """Propose `time` and its unit, or `rate_hz`; with facts about it."""
-    place = str(proposal.path)
-    table = arrays.table(dict.fromkeys(guess.times, place)) if arrays else read_table(proposal.path)
+    place = str(about.path)
+    table = arrays.table(dict.fromkeys(guess.times, place)) if arrays else read_table(about.path)
     for name in guess.times:
         with contextlib.suppress(BadData):  # dates, or another column of this name
             time = read_columns(table, [name], place, "time")[:, 0]
             break
     else:
         dates = table.select(*dict.fromkeys(guess.times))
-        _propose_rate(proposal, dates, () if arrays else read_first_lines(proposal.path))
+        _propose_rate(about, dates, () if arrays else read_first_lines(about.path))
         return
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     named = guess.units.get(name)
     unit = named if named is not None and 0.0 < step * TIME_UNITS[named] < LONGEST_STEP_S else guess_time_unit(step)
-    proposal.data["time"] = name
+    about.data["time"] = name
     if unit not in (None, "s"):
         reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
-        proposal.facts.append(f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):.4g} Hz")
-        proposal.data["time_unit"] = unit
+        about.facts.append(f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):.4g} Hz")
+        about.data["time_unit"] = unit
         if unit != named:
-            proposal.checks["time_unit"] = reason
+            about.checks["time_unit"] = reason
 
 
-def _propose_rate(proposal: _Proposal, dates: pl.DataFrame, lines: Sequence[str]) -> None:
+def _propose_rate(about: Description, dates: pl.DataFrame, lines: Sequence[str]) -> None:
     """Propose the rate of a file without times in numbers: by its dates or times of day, or as a line states it."""
     for name in dates.columns:
         texts = dates[name].cast(pl.String).str.strip_chars()
@@ -367,90 +376,49 @@ def _propose_rate(proposal: _Proposal, dates: pl.DataFrame, lines: Sequence[str]
             with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
                 ticks = texts.str.strptime(kind, form, strict=False).cast(pl.Int64).drop_nulls().to_numpy()
                 if len(ticks) and (span := float(np.ptp(ticks)) * tick_s):
-                    rate_hz = proposal.data["rate_hz"] = float(f"{(len(ticks) - 1) / span:.6g}")
-                    proposal.facts.append(f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz")
+                    rate_hz = about.data["rate_hz"] = float(f"{(len(ticks) - 1) / span:.6g}")
+                    about.facts.append(f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz")
                     return
     if stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
-        proposal.data["rate_hz"] = float(stated["rate"])
-        proposal.facts.append(f"no column looks like time; the file says '{stated[0]}'")
+        about.data["rate_hz"] = float(stated["rate"])
+        about.facts.append(f"no column looks like time; the file says '{stated[0]}'")
     else:
-        proposal.data["rate_hz"], proposal.checks["rate_hz"] = ASSUMED_RATE_HZ, "no column looks like time"
+        about.data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, "no column looks like time"
 
 
 # Text of the session ---------------------------------------------------------------------------------------------
 
 
-def _find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
-    """Find the intervals [s], of at least `SHORTEST_STATIC_S`, in which all sensors are static."""
-    size = max(2, round(BLOCK_S * recording.rate_hz))
-    blocks = len(recording) // size
-
-    def split(values: np.ndarray) -> np.ndarray:
-        return values[: blocks * size].reshape(blocks, size, *values.shape[1:])
-
-    static = np.ones(blocks, dtype=bool)
-    for sensor in recording.sensors.values():
-        rate = split(compute_rate(sensor, recording.rate_hz))
-        mean = rate.mean(axis=1, keepdims=True)
-        # A bias is below the rate of a person who rotates evenly.
-        static &= np.linalg.norm(mean[:, 0], axis=1) < 3.0 * STATIC_GYRO
-        if isinstance(sensor, ImuSensor):
-            rate = rate - mean
-            static &= np.sqrt(split(sensor.accel_S).var(axis=1).sum(axis=1)) < STATIC_ACCEL
-        static &= np.sqrt((rate**2).sum(axis=2).mean(axis=1)) < STATIC_GYRO
-        if sensor.gap is not None:
-            static &= ~split(sensor.gap).any(axis=1)
-    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
-    return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
-
-
-def _format_session(proposal: _Proposal, model: Path | None, recording: Recording | None) -> str:
+def _format_session(about: Description, folder: Path, body: BodyTable, model: Path | None) -> str:
     """Format the session as TOML; sensors on unknown segments are in comments.
 
-    `model` is the body's file, or its name in the package; None: the upper body's. `recording`: the data, if readable.
+    `model` is the body's file, or its name in the package; None: the upper body's.
     """
-    body, segments = proposal.body, list(proposal.body.segments)
+    recording, segments = about.recording, list(body.segments)
     static = _find_static_intervals(recording) if recording is not None else []
-    head = {"name": proposal.path.stem}
+    head = {"name": about.path.stem}
     if model is not None:
-        head["model"] = proposal.relative(model) if model.is_file() else str(model)
-    lines = [*format_keys({**head, "start_pose": "n_pose"}), "", "[data]", *format_keys(proposal.data, proposal.checks)]
-    lines += ["", "[phases]   # seconds"]
-    if proposal.phases:  # as they were marked live
-        lines += format_keys(proposal.phases)
-    elif recording is not None:
-        lines += _propose_phases(proposal, recording, static)
-    for segment in sorted(proposal.sensors, key=lambda name: segments.index(name) if name in segments else 99):
+        head["model"] = _relative(model, folder) if model.is_file() else str(model)
+    lines = [*format_keys({**head, "start_pose": "n_pose"}), "", "[data]", *format_keys(about.data, about.checks)]
+    lines += ["", "[phases]   # seconds", *format_keys(about.phases)]  # as they were marked live
+    if not about.phases:
+        if static:
+            spans = f"[[{static[0][0]:.2f}, {static[0][1]:.2f}]]"
+            lines.append(f"start = {spans}   # CHECK: all sensors are static there; is it the start pose?")
+        else:
+            lines.append("# start = [[FROM, TO]]   # the seconds in which the person stands still in the start pose")
+        # A sensor on an unknown segment may be one that is needed.
+        if body.draw.paths and not (set(about.sensors) <= set(segments) and set(body.needed) - set(about.sensors)):
+            lines.append("# clasp = [[FROM, TO]]   # for wepose calibrate: the seconds in which the palms are together")
+    for segment in sorted(about.sensors, key=lambda name: segments.index(name) if name in segments else 99):
         known = segment in segments
         place = body.sensors[segment].place if segment in body.sensors else ""
         table = [f"[sensors.{segment if known else 'SEGMENT'}]{f'   # usually {place}' if place else ''}"]
-        table += format_keys(proposal.sensors[segment], proposal.checks)
+        table += format_keys(about.sensors[segment], about.checks)
         if recording is not None and not recording.sensors[segment].aligned:
             table.append(_propose_mount(recording, segment, static))
         lines += ["", *(line if known else f"# {line}" for line in table)]
     return "\n".join(lines) + "\n"
-
-
-def _propose_phases(proposal: _Proposal, recording: Recording, static: Sequence[tuple[float, float]]) -> Iterator[str]:
-    """Propose the start phase where all sensors are static, else an example; and an example of a clasp."""
-    begin, end = float(recording.time[0]), float(recording.time[-1])
-    if static:
-        spans = f"[[{static[0][0]:.2f}, {static[0][1]:.2f}]]"
-        yield f"start = {spans}   # CHECK: all sensors are static there; is it the start pose?"
-    if end - begin < 2.0:
-        return
-
-    def example(first: float, last: float) -> str:
-        return f"[[{np.ceil(10.0 * first) / 10.0:.1f}, {np.floor(10.0 * last) / 10.0:.1f}]]"
-
-    if not static:
-        spans = example(begin + 0.5, min(begin + 4.5, end))
-        yield f"# start = {spans}   # name the seconds in which the person stands still in the start pose"
-    body, sensors = proposal.body, set(proposal.sensors)
-    lacking = sensors <= set(body.segments) and set(body.needed) - sensors  # else an unknown one may be a needed one
-    if body.draw.paths and not lacking:
-        spans = example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
-        yield f"# clasp = {spans}   # for wepose calibrate: the seconds in which the palms are held together"
 
 
 def _propose_mount(recording: Recording, segment: str, static: Sequence[tuple[float, float]]) -> str:

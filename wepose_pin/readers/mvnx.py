@@ -11,7 +11,6 @@ Source: MVN User Manual, MVNX structure; the frames `tpose` and `tpose-isb` of e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,13 +18,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..body import load_table
-from ..body.subject import Subject, load_subject, population_subject
-from ..body.table import ROOT
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..libraries import library_errors
-from .device import Device, DeviceSensor, Reference, check_measured
+from .device import Device, Reference, Signal, check_measured, make_device
 
 _SIDES = ("Left", "Right")
 SEGMENT_OF = {
@@ -39,12 +35,10 @@ JOINT_OF = {
     for side in _SIDES
     for part, joint in (("UpperArm", "shoulder"), ("ForeArm", "elbow"), ("Hand", "wrist"), ("UpperLeg", "hip"))
 }
-HIPS = ("left_hip", "right_hip")  # the root is midway between them
 # In the T-pose each of Xsens's frames is one of these, but for the tilts of that pose: 13 deg at the head.
 _QUARTERS = Rotation.create_group("O")
 WIDTH = {"orientation": 4, "position": 3, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
-# Of its lengths [m]: MVN scales a body to the subject's height and a few measures.
-LENGTH_STD = 0.01
+RAW = ("sensorAngularVelocity", "sensorAcceleration")
 
 
 class Frames(NamedTuple):
@@ -60,27 +54,23 @@ class Frames(NamedTuple):
 def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """Read the sensors, or the segments' orientations, as `Format.read`; `rate_hz` goes before the file's frameRate."""
     frames = read_frames(path, rate_hz)
-    raw = {"sensorAngularVelocity", "sensorAcceleration"} <= set(frames.values)
-    if use == "raw" and not raw:
-        raise BadData(f"{path}: no sensorAngularVelocity and sensorAcceleration; leave out data.use for orientations")
-    diagnostics = _diagnose_frames(path, frames)
-    signals: dict[str, dict[str, np.ndarray]]
-    if raw and use != "orientation":
-        kind, diagnostics = "raw", ()
-        gyro, accel = (frames.values[f"sensor{name}"] for name in ("AngularVelocity", "Acceleration"))
-        signals = {label: {"gyro": gyro[:, k], "accel": accel[:, k]} for k, label in enumerate(frames.sensors)}
+    signals: dict[str, dict[str, Signal]]
+    if use != "orientation" and set(RAW) <= set(frames.values):
+        gyro, accel = (frames.values[tag] for tag in RAW)
+        signals = {
+            label: {"gyro": Signal(frames.time, gyro[:, k]), "accel": Signal(frames.time, accel[:, k])}
+            for k, label in enumerate(frames.sensors)
+            if label in SEGMENT_OF
+        }
     else:
-        kind = "orientation"
-        signals = {label: {"orientation": quat} for label, quat in _read_quats(frames).items()}
-    sensors = {
-        label: DeviceSensor(frames.time, values, SEGMENT_OF[label])
-        for label, values in signals.items()
-        if label in SEGMENT_OF
-    }
-    if not sensors:
+        signals = {label: {"orientation": Signal(frames.time, quat)} for label, quat in _read_quats(frames).items()}
+    if not signals:
         listed = ", ".join(frames.segments[:12])
         raise BadData(f"{path}: none of the upper body's segments, such as T8; there is: {listed}")
-    return Device(kind, sensors, since_power_on=False, aligned=kind == "orientation", diagnostics=diagnostics)
+    device = make_device(path, signals, " and ".join(RAW), use)
+    aligned = device.kind == "orientation"
+    diagnostics = _diagnose_frames(path, frames) if aligned else ()
+    return device._replace(since_power_on=False, aligned=aligned, diagnostics=diagnostics)
 
 
 def read_mvnx_reference(path: Path) -> Reference:
@@ -94,34 +84,6 @@ def _diagnose_frames(path: Path, frames: Frames) -> tuple[Diagnostic, ...]:
     if frames.t_pose is not None:
         return ()
     return (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
-
-
-def read_subject(path: Path) -> Subject:
-    """Read ``subject.toml``, the folder that holds it, or the lengths in an MVNX.
-
-    The lengths between MVN's joints are taken as they are, with the standard deviation `LENGTH_STD`; the others are the
-    population's. `WeposeError` is raised where it is not there, is no subject, or has no lengths.
-    """
-    if path.suffix.lower() != ".mvnx":
-        return load_subject(path)
-    joints, lengths, prior = _find_joints(read_frames(path)), dict[str, float](), population_subject()
-    if set(HIPS) <= set(joints):
-        joints[ROOT] = np.mean([joints[hip] for hip in HIPS], axis=0)
-    for name, length in load_table().lengths.items():
-        if {*length.start, *length.end} <= set(joints):
-            first, last = (np.mean([joints[point] for point in end], axis=0) for end in (length.start, length.end))
-            lengths[name] = float(np.nanmedian(np.linalg.norm(last - first, axis=1)))
-    if not lengths:
-        raise BadData(f"{path}: no positions of the arms' segments in it; export it with <position>")
-    known = np.array([name in lengths for name in prior.order])
-    return replace(
-        prior,
-        name=path.stem,
-        lengths={**prior.lengths, **lengths},
-        covariance=np.where(known[:, None] | known, 0.0, prior.covariance)
-        + np.diag(np.where(known, LENGTH_STD**2, 0.0)),
-        note=f"lengths of {path.name}; the others are the population's",
-    )
 
 
 def _find_joints(frames: Frames) -> dict[str, np.ndarray]:

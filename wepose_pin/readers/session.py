@@ -2,40 +2,192 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import polars as pl
 
+from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..documents import TomlTable
-from ..errors import BadData, BadSession, MissingFile, one_of
-from ..recording import ImuSensor, OrientationSensor, Recording, Sensor, check_phases, check_recording, format_span
+from ..documents import Key, TomlTable, is_number, read_record, read_toml, toml_key, toml_string
+from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printable
+from ..recording import (
+    CONFIGURATION,
+    ImuSensor,
+    Intervals,
+    OrientationSensor,
+    Recording,
+    Sensor,
+    check_phases,
+    check_recording,
+    compute_mount,
+    format_span,
+)
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
 from ..recording.faults import Fault, check_sensors
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples, resample
 from ..recording.plausibility import check_signals
+from ..recording.sensors import read_axes
 from .arrays import ArrayFile, is_array_file
-from .device import ACCEL_UNITS, GYRO_UNITS, Device, check_measured
+from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device, check_measured
 from .registry import detect_format, find_format, read_device
-from .session_file import (
-    OF_COLUMNS,
-    OF_FORMATS,
-    WIDTHS,
-    SensorKeys,
-    check_columns,
-    read_data_keys,
-    read_head,
-    read_sensor_keys,
-    read_session_file,
-)
 
+# Suffixes of data files.
+DATA = (
+    *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto"),
+    *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".c3d", ".trc"),
+)
+SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
+# Keys of earlier versions, with their replacements.
+_RENAMED_PHASES = {
+    "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
+}
+# Keys of a sensor that have an effect only where a format reads the file, or only where the session names columns.
+OF_FORMATS = ("format", "label", "use")
+OF_COLUMNS = ("gyro_unit", "accel_unit", "time", "time_unit")
+WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
+_FIELDS = {"gyro": "gyro_S", "accel": "accel_S", "orientation": "quat_VS"}  # signal → field of a `Sensor`
 NORM_ERROR = 1e-2  # of a quaternion, from rounded decimals
 MOST_LOST = 0.01  # share of samples lost in short gaps, above which it is a diagnostic
+_UNITS = {"time_unit": TIME_UNITS, "gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}
+_CHOICES: dict[str, Collection[str]] = {"use": NEEDED, **_UNITS}
+
+
+class SensorKeys(NamedTuple):
+    """The keys of a sensor's table, or of [data], which hold for every sensor that does not state them."""
+
+    file: str = ""
+    format: str = ""
+    use: Annotated[str, Key(of="use")] = ""
+    time: str = ""
+    time_unit: Annotated[str, Key(of="time_unit")] = "s"
+    rate_hz: Annotated[float | None, Key(least=1e-3)] = None
+    offset_s: Annotated[float, Key(least=-1e12, most=1e12)] = 0.0  # between a clock since 1970 and one since power-on
+    gyro_unit: Annotated[str, Key(of="gyro_unit")] = ""
+    accel_unit: Annotated[str, Key(of="accel_unit")] = ""
+    label: str = ""
+    aligned: bool | None = None
+    ignore: bool = False
+    # Signal → columns, or one array; empty where the file's format defines them.
+    signals: Annotated[Mapping[str, list[str]], None] = MappingProxyType({})
+    mount: Annotated[np.ndarray | None, None] = None  # (4,) xyzw
+
+
+def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> TomlTable:
+    """Read a session file, or the one in a folder; `values` are its contents where it does not exist yet."""
+    path = path / "session.toml" if path.is_dir() else path
+    if path.suffix.lower() in DATA:
+        written = f"which `wepose info {path.name} --write` writes"
+        raise BadSession(f"{path}: is a table of data by its name; a session file is wanted here, {written}")
+    top = TomlTable(read_toml(path, "a session file") if values is None else values, str(path))
+    top.allow(*SESSION_KEYS)
+    return top
+
+
+def read_head(top: TomlTable) -> Recording:
+    """Read what a session file states besides its data: a recording without sensors and samples."""
+    path, name = Path(top.file), top.text("name", None)
+    start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
+    joints, truth = top.table("joints", {}), top.table("data", {}).text("truth", None)
+    if joints.values and start_pose != CONFIGURATION:
+        raise BadSession(f'{top.at("joints")} needs start_pose = "{CONFIGURATION}", and it is "{start_pose}"')
+    if truth is not None and not (path.parent / truth).is_file():
+        place = top.table("data").at("truth")
+        raise MissingFile(f"{place}: no such file '{truth}' beside {path.name}; name it rightly or leave it out")
+    return Recording(
+        name=printable(name or path.absolute().parent.name or path.stem),
+        time=np.empty(0),
+        rate_hz=0.0,
+        sensors={},
+        phases=_read_phases(top.table("phases", {})),
+        start_pose=start_pose,
+        joints={joint: joints.number(joint, None) or 0.0 for joint in joints.values},
+        model=_find_model(path, top),
+        remounted=top.flag("remounted"),
+        source=path,
+        truth=None if truth is None else path.parent / truth,
+    )
+
+
+def _find_model(path: Path, top: TomlTable) -> str:
+    """Find the body that the session names: a file beside it, or the name of a body of the package; empty: none."""
+    name = top.text("model", None) or ""
+    file = path.parent / name
+    if name and not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
+        needed = "a URDF, its table, or the name of a body of the package is needed"
+        raise MissingFile(f"{top.at('model')}: no such file '{name}' beside {path.name}; {needed}")
+    return str(file) if file.is_file() else name
+
+
+def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
+    """Read the intervals [s] of each phase."""
+    keys.allow(*keys.values, renamed=_RENAMED_PHASES)
+    phases: dict[str, Intervals] = {}
+    for name, value in keys.values.items():
+        pairs: list[Any] = value if isinstance(value, list) else [None]
+        if not all(isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) for pair in pairs):
+            raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
+        phases[name] = tuple((float(a), float(b)) for a, b in pairs)
+        for first, last in phases[name]:
+            if not first < last:
+                raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
+    return phases
+
+
+def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
+    """Read the keys of a sensor; those that its table lacks are those of [data]."""
+    keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))
+    if "time" in table or "rate_hz" in table:  # one replaces the other
+        keys = keys._replace(time=table.text("time", None) or "", rate_hz=table.number("rate_hz", None))
+    if "mount" in table:
+        axes = table.table("mount")
+        axes.allow("up", "forward")
+        keys = keys._replace(mount=compute_mount(*read_axes(axes)))
+    if not any(signal in table for signal in WIDTHS):
+        return keys
+    needed = NEEDED["orientation"] if "orientation" in table else NEEDED["raw"]
+    if other := next((signal for signal in WIDTHS if signal in table and signal not in needed), None):
+        raise BadSession(f"{table.at('orientation')} stands beside {other}; a sensor has one or the other")
+    signals = {}
+    for signal in needed:
+        value = table.values.get(signal)
+        signals[signal] = [value] if isinstance(value, str) and value else table.names(signal, WIDTHS[signal])
+    return keys._replace(signals=signals)
+
+
+def _check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
+    """Raise `BadSession` where two sensors name one column."""
+    owners: dict[tuple[str, str], str] = {}
+    for name, each in keys.items():
+        for signal, column in ((signal, column) for signal, own in each.signals.items() for column in own):
+            if (owner := owners.setdefault((each.file, column), name)) != name:
+                place = tables[name].at(signal)
+                raise BadSession(f"{place}: '{column}' of {each.file} is a column of sensors.{owner} too")
+
+
+def format_keys(keys: Mapping[str, Any], checks: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+    """Format the keys of a table, one a line; `checks`: key → what the user has to check there."""
+    return [
+        f"{toml_key(key)} = {_format_value(value)}" + (f"   # CHECK: {checks[key]}" if key in checks else "")
+        for key, value in keys.items()
+    ]
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, str):
+        return toml_string(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_format_value, value))}]"
+    return f"{{ {', '.join(format_keys(value))} }}" if isinstance(value, Mapping) else json.dumps(value)
+
+
+# The recording -----------------------------------------------------------------------------------------------------
 
 
 def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | None = None) -> Recording:
@@ -59,69 +211,59 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     tables = {name: stated.table(name) for name in stated.values}
     keys = {name: read_sensor_keys(table, files.keys) for name, table in tables.items()}
     keys = {name: each for name, each in keys.items() if not each.ignore}
-    check_columns(tables, keys)
+    _check_columns(tables, keys)
     if not keys:
         raise BadSession(f"{path}: no sensors; one [sensors.<segment>] table each, without # before its lines")
     head = read_head(top)
     devices = {name: files.open_device(tables[name], each) for name, each in keys.items() if not each.signals}
-    measured: dict[str, _Measured] = {}
     alike = len({bool(each.signals) for each in keys.values()}) == 1
+    clocks: dict[str, Clock] = {}  # of each sensor, with lost rows filled in
+    rows: dict[str, Sensor] = {}  # as its file has them, without lost rows
     for name, each in keys.items():
         table, unused = tables[name], OF_FORMATS if each.signals else OF_COLUMNS
-        if places := [own.at(key) for own in (table, *[files.data] * alike) for key in unused if key in own]:
+        for key, own in ((key, own) for own in (table, *[files.data] * alike) for key in unused if key in own):
             why = "the columns are named here" if each.signals else "the format of the file defines it"
-            raise BadSession(f"{places[0]} has no effect, as {why}; remove it")
+            raise BadSession(f"{own.at(key)} has no effect, as {why}; remove it")
         if name in devices:
-            measured[name] = files.take_sensor(name, table, each, devices)
+            clocks[name], rows[name] = files.take_sensor(name, table, each, devices)
         else:
-            measured[name] = files.read_sensor(table, each)
-        if measured[name].aligned and ("mount" in table or "orientation" not in measured[name].values):
-            raise BadSession(f"{table.where}: aligned orientations are the segment's own: no mount, and no raw data")
-    files.tables.clear()  # of a day they are gigabytes
-    time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
+            clocks[name], rows[name] = files.read_sensor(table, each)
+    places = {name: f"{files.find_file(each)}: {tables[name].place}" for name, each in keys.items()}
+    diagnostics = files.diagnostics
+    del files  # of a day its tables are gigabytes
+    time, resampled = find_common_time(str(path), clocks)
     check_phases(str(path), time, head.phases)
     start = next(iter(head.phases.get("start", ())), None)
-    samples = {name: (each.clock.time[each.clock.row >= 0], *each.values.values()) for name, each in measured.items()}
+    samples = {name: (clock.time[clock.row >= 0], *_signals(rows[name]).values()) for name, clock in clocks.items()}
     faults, gyro_range, frozen = check_sensors(str(path), samples, start)
     sensors: dict[str, Sensor] = {}
-    diagnostics = [*resampled, *files.diagnostics, *frozen]
-    for segment, own in measured.items():
-        sensor, marks = _bridge_gaps(own, faults.get(segment, []), gaps)
+    diagnostics = [*resampled, *diagnostics, *frozen]
+    for segment, clock in clocks.items():
+        sensor, marks = _bridge_gaps(places[segment], rows[segment], clock, faults.get(segment, []), gaps)
         if isinstance(sensor, ImuSensor):
             sensor = replace(sensor, gyro_range=gyro_range[segment])
-        sensors[segment] = resample(sensor, own.clock.time, time) if resampled else sensor
-        diagnostics += _report_bridged_gaps(segment, marks, own.clock.step)
+        sensors[segment] = resample(sensor, clock.time, time) if resampled else sensor
+        diagnostics += _report_bridged_gaps(segment, marks, clock.step)
     recording = replace(head, time=time, rate_hz=measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics))
     check_recording(recording)
     return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
 
 
-class _Measured(NamedTuple):
-    """The samples of a sensor as its file has them."""
-
-    place: str  # the file and the sensor, for messages
-    columns: Mapping[str, list[str]]  # names in the file, by signal
-    clock: Clock  # its times, with lost rows filled in
-    values: Mapping[str, np.ndarray]  # signal → (n, k) in SI, of the rows of the file
-    mount: np.ndarray | None  # (4,) xyzw, sensor to segment; None: not stated
-    aligned: bool  # its orientations are the segment's own
-
-
-# Files -------------------------------------------------------------------------------------------------------------
+def _signals(sensor: Sensor) -> dict[str, np.ndarray]:
+    return {signal: getattr(sensor, name) for signal, name in _FIELDS.items() if hasattr(sensor, name)}
 
 
 class _Files:
     """The files that a session names, each read once."""
 
     def __init__(self, path: Path, data: TomlTable) -> None:
-        self.path, self.data, self.keys = path, data, read_data_keys(data)
-        self.tables: dict[Path, pl.DataFrame] = {}
+        self.path, self.data = path, data
+        self.keys = read_record(SensorKeys, data, _CHOICES, others=("truth",))
         self.diagnostics: list[Diagnostic] = []  # what devices assumed, and files whose times are those of packets
-        self._devices: dict[tuple[object, ...], Device] = {}
-        self._arrays: dict[Path, ArrayFile] = {}
-        self._clocks: dict[tuple[object, ...], Clock] = {}
+        self._read: dict[tuple[object, ...], Any] = {}
 
-    def _find_file(self, keys: SensorKeys) -> Path:
+    def find_file(self, keys: SensorKeys) -> Path:
+        """Find the file of a sensor; `BadSession`: none is named."""
         if not keys.file:
             raise BadSession(f"{self.data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
         return self.path.parent / keys.file
@@ -130,46 +272,53 @@ class _Files:
         """Return the place of a key of a sensor, which may stand in [data]."""
         return (table if key in table else self.data).at(key)
 
+    def _once(self, read: Callable[..., Any], *arguments: Any) -> Any:
+        """Read a file, and take its diagnostics, the first time that it is read so."""
+        key = (read, *arguments)
+        if key not in self._read:
+            self._read[key] = content = read(*arguments)
+            self.diagnostics += getattr(content, "diagnostics", ())
+        return self._read[key]
+
     def open_device(self, table: TomlTable, keys: SensorKeys) -> Device:
         """Read the file of a sensor without columns, whose format defines them."""
-        path = self._find_file(keys)
+        path = self.find_file(keys)
         if not keys.format and not path.exists():
             raise MissingFile(f"{path}: no such file or folder")
         place = self._at(table, "format")
         format = find_format(keys.format, self.path.parent, place) if keys.format else detect_format(path)
         if format is None:
             table.names("gyro", WIDTHS["gyro"])  # an error: the session must name the columns of a table
-        key = (path, format, keys.use, keys.rate_hz)
-        if key not in self._devices:
-            self._devices[key] = device = read_device(path, str(format), keys.use or None, keys.rate_hz)
-            self.diagnostics += device.diagnostics
-        return self._devices[key]
+        device: Device = self._once(read_device, path, str(format), keys.use or None, keys.rate_hz)
+        return device
 
-    def take_sensor(self, segment: str, table: TomlTable, keys: SensorKeys, devices: Mapping[str, Device]) -> _Measured:
+    def take_sensor(
+        self, segment: str, table: TomlTable, keys: SensorKeys, devices: Mapping[str, Device]
+    ) -> tuple[Clock, Sensor]:
         """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor.
 
         Devices whose clocks start at power-on are shifted together, so that the earliest begins at zero.
         """
-        path, device = self._find_file(keys), devices[segment]
+        path, device = self.find_file(keys), devices[segment]
         labels = [label for label, each in device.sensors.items() if each.segment == segment] or list(device.sensors)
         if keys.label:
             labels = [table.choice("label", device.sensors, keys.label)]
         if len(labels) != 1:
             raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
-        (label,) = labels
-        sensor = device.sensors[label]
+        sensor = device.sensors[labels[0]]
         offset_s = keys.offset_s
         if device.since_power_on:
             offset_s -= min(each.begin for each in devices.values() if each.since_power_on)
         clock = self._build_clock((path, id(sensor.time), offset_s), path, sensor.time + offset_s, str(path))
-        columns = {signal: [f"{label} {signal}"] for signal in sensor.signals}
-        mount = sensor.mount if keys.mount is None else keys.mount
-        aligned = device.aligned if keys.aligned is None else keys.aligned
-        return _Measured(f"{path}: {table.place}", columns, clock, sensor.signals, mount, aligned)
+        if keys.mount is None:
+            keys = keys._replace(mount=sensor.mount)
+        if keys.aligned is None:
+            keys = keys._replace(aligned=device.aligned)
+        return clock, _make_sensor(table, keys, sensor.signals)
 
-    def read_sensor(self, table: TomlTable, keys: SensorKeys) -> _Measured:
+    def read_sensor(self, table: TomlTable, keys: SensorKeys) -> tuple[Clock, Sensor]:
         """Read the columns or arrays of a sensor, which the session names."""
-        path = self._find_file(keys)
+        path = self.find_file(keys)
         if bool(keys.time) == (keys.rate_hz is not None):
             stated = "both is" if keys.time else "neither is"
             raise BadSession(f"{self._at(table, 'time')} or rate_hz is needed, one of the two, and {stated} there")
@@ -180,9 +329,7 @@ class _Files:
             units[signal] = known.get(unit, 1.0)
         columns = dict(keys.signals)
         if is_array_file(path):
-            if path not in self._arrays:
-                self._arrays[path] = ArrayFile(path)
-            file = self._arrays[path]
+            file = self._once(ArrayFile, path)
             for signal, names in columns.items():
                 if len(names) == 1:
                     columns[signal] = file.expand(names[0], WIDTHS[signal], table.at(signal))
@@ -191,9 +338,7 @@ class _Files:
         else:
             for signal in (signal for signal, names in columns.items() if len(names) == 1):
                 table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
-            if path not in self.tables:
-                self.tables[path] = read_table(path)
-            content = self.tables[path]
+            content = self._once(read_table, path)
         if keys.rate_hz is not None:
             time, source = np.arange(content.height) / keys.rate_hz, self._at(table, "rate_hz")
         else:
@@ -201,59 +346,66 @@ class _Files:
             time = TIME_UNITS[keys.time_unit] * time
         key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
         clock = self._build_clock(key, path, time + keys.offset_s, source)
-        values = {
+        signals = {
             signal: units[signal] * read_columns(content, names, str(path), table.at(signal))
             for signal, names in columns.items()
         }
-        if path in self.tables:  # columns that have been read make room: of a day the table is gigabytes
+        if (read_table, path) in self._read:  # columns that have been read make room: of a day the table is gigabytes
             read = [name for names in columns.values() for name in names]
-            self.tables[path] = content.with_columns(pl.lit(None).alias(name) for name in read)
-        return _Measured(f"{path}: {table.place}", columns, clock, values, keys.mount, bool(keys.aligned))
+            self._read[read_table, path] = content.with_columns(pl.lit(None).alias(name) for name in read)
+        return clock, _make_sensor(table, keys, signals)
 
     def _build_clock(self, key: tuple[object, ...], path: Path, time: np.ndarray, source: str) -> Clock:
         """Build the clock of sensors, once of those that share it."""
-        if key not in self._clocks:
-            self._clocks[key] = clock = build_clock(time, source)
+        if key not in self._read:
+            self._read[key] = clock = build_clock(time, source)
             if clock.packet > 1:
                 facts: dict[str, float | str] = {"variant": "packets", "packet": clock.packet}
                 self.diagnostics.append(Diagnostic("time-stamps-uneven", INFO, path.name, facts=facts))
-        return self._clocks[key]
+        built: Clock = self._read[key]
+        return built
+
+
+def _make_sensor(table: TomlTable, keys: SensorKeys, signals: Mapping[str, np.ndarray]) -> Sensor:
+    """Make a sensor of its rows, in SI, as the file has them."""
+    if keys.aligned and ("mount" in table or "orientation" not in signals):
+        raise BadSession(f"{table.where}: aligned orientations are the segment's own: no mount, and no raw data")
+    if "orientation" in signals:
+        return OrientationSensor(signals["orientation"], keys.mount, aligned=bool(keys.aligned))
+    return ImuSensor(signals["gyro"], signals["accel"], keys.mount)
 
 
 # Gaps --------------------------------------------------------------------------------------------------------------
 
 
-def _bridge_gaps(measured: _Measured, faults: Sequence[Fault], gaps: bool) -> tuple[Sensor, np.ndarray]:
+def _bridge_gaps(
+    place: str, sensor: Sensor, clock: Clock, faults: Sequence[Fault], gaps: bool
+) -> tuple[Sensor, np.ndarray]:
     """Put the rows on the clock and bridge gaps, long ones where `gaps` are accepted; and the marks (n,) of samples."""
-    clock = measured.clock
     frozen = np.zeros(len(clock.time), dtype=bool)
     for fault in faults:
         frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
     signals, lost = {}, frozen.copy()
-    for name, rows in measured.values.items():
-        place = f"{measured.place}{name}"
-        check_measured(place, rows)
-        signals[name], good = _place_on_clock(rows, clock, place, name == "orientation")
+    for signal, rows in _signals(sensor).items():
+        check_measured(f"{place}{signal}", rows)
+        signals[signal], good = _place_on_clock(rows, clock, f"{place}{signal}", signal == "orientation")
         if not good.any():
-            listed = ", ".join(measured.columns[name])
-            raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {listed}")
+            raise BadData(f"{place}{signal}: no numbers from {format_span(clock.time[[0, -1]])}")
         if not gaps and (long := find_runs(mark_lost_samples(clock, good) == LONG)):
             first, last = long[0]
             lost_s, row = (last - first) * clock.step, clock.row[:first].max(initial=-1) + 1
             raise BadData(
-                f"{place}: samples are missing for {lost_s:.3f} s from {clock.time[first]:.3f} s, after row {row}; up "
-                f"to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
+                f"{place}{signal}: samples are missing for {lost_s:.3f} s from {clock.time[first]:.3f} s, after row "
+                f"{row}; up to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
             )
         lost |= ~good
     marks = mark_lost_samples(clock, ~lost)
-    gap = marks == LONG if gaps or faults else None
-    marks_reported = np.where(frozen, GOOD, marks)  # frozen samples have a diagnostic of their own
-    if "orientation" in signals:
-        quat = bridge_quat(signals["orientation"], marks, clock)
-        return OrientationSensor(quat, measured.mount, gap, measured.aligned), marks_reported
-    gyro_S = bridge(signals["gyro"], marks, clock)
-    accel_S = bridge(signals["accel"], marks, clock)
-    return ImuSensor(gyro_S, accel_S, measured.mount, gap), marks_reported
+    bridged: dict[str, Any] = {
+        _FIELDS[signal]: (bridge_quat if signal == "orientation" else bridge)(values, marks, clock)
+        for signal, values in signals.items()
+    }
+    bridged["gap"] = marks == LONG if gaps or faults else None
+    return replace(sensor, **bridged), np.where(frozen, GOOD, marks)  # frozen samples have a diagnostic of their own
 
 
 def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import polars as pl
 
 from ..body.kinematics import Pose, build_pose_table
 from ..documents import toml_key
-from ..readers.session_file import format_keys
+from ..readers.session import format_keys
 from ..recording import ImuSensor, Recording, find_mount_axes
 from .result import write_table
 
