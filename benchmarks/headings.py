@@ -26,7 +26,7 @@ from wepose_pin.simulation import (
 from wepose_pin.simulation.motion import TASKS, Motion, aim_ray
 from wepose_pin.simulation.people import place_shoulder
 from wepose_pin.simulation.signals import Wander, make_pulse
-from wepose_pin.tracking import TrackOptions, TrackResult, track, track_chunks
+from wepose_pin.tracking import Tracker, TrackResult, track, track_chunks
 
 from .tables import Column, Section, Table
 
@@ -188,13 +188,12 @@ def measure_live_headings(minutes: float) -> Table:
     recording = simulation.recording()
     unmarked = replace(recording, phases={"start": recording.phases["start"]})
     ways = {
-        "open": (unmarked, TrackOptions(causal=True, open_loop=True)),
-        "live": (unmarked, TrackOptions(causal=True)),
-        "offline": (recording, TrackOptions()),
+        "open": (unmarked, Tracker(subject, causal=True, open_loop=True)),
+        "live": (unmarked, Tracker(subject, causal=True)),
+        "offline": (recording, Tracker(subject)),
     }
     errors = {
-        way: compare_headings(simulation, track_chunks(of, subject, options=options, chunk_s=CHUNK_S))
-        for way, (of, options) in ways.items()
+        way: compare_headings(simulation, track_chunks(tracker, of, CHUNK_S)) for way, (of, tracker) in ways.items()
     }
     table = Table(
         f"Relative headings, live: {minutes:g} min of random motion of preset people, a clasp of {CLASP_S:g} s every "

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import ImuSensor, Recording, Simulation, TrackResult, WeposeError, track
-from wepose_pin.tracking import Tracker, TrackOptions
+from wepose_pin.tracking import Tracker
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +28,12 @@ def whole(recording: Recording) -> TrackResult:
     return track(recording, causal=True)
 
 
-def started(recording: Recording, method: str) -> tuple[Any, int]:
+def started(recording: Recording, method: str) -> tuple[Tracker, int]:
     """A causal tracker as a live session has it, whose start pose has just ended, and the sample that comes next."""
     begin = recording.span(recording.phases["start"][0]).stop
-    tracker = Tracker(options=TrackOptions(method, causal=True))
+    tracker = Tracker(method=method, causal=True)
     assert tracker.push(recording.cut(slice(0, begin))) is None
-    return tracker.segment_estimator, begin
+    return tracker, begin
 
 
 def columns(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -66,7 +65,7 @@ def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(record
         for i, name in enumerate(tracker.names):
             assert np.array_equal(stepped[i], pose.quat_WL[name][k - begin]), (name, k)
         if k % 7 == 0 and pose.segments.covariance_W:
-            covariance = [each for each in tracker.covariance_gradually() if each is not None][-1]
+            covariance = [tracker.compute_covariance(i) for i in range(len(tracker.names))]
             stated = [pose.segments.covariance_W[name][k - begin] for name in tracker.names]
             np.testing.assert_allclose(covariance, stated, rtol=1e-9, atol=1e-12, err_msg=f"{k}")
     assert pose.time[0] == recording.time[begin]

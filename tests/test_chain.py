@@ -27,7 +27,7 @@ from wepose_pin import (
     track,
 )
 from wepose_pin.recording import compute_mount
-from wepose_pin.tracking import track_chunks
+from wepose_pin.tracking import Tracker, track_chunks
 from wepose_pin.writers import write_session
 
 RATE = 100.0
@@ -274,7 +274,7 @@ def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> No
 def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> None:
     recording, _ = made(urdf, MARKED_WITH_SENSORS, 20.0)
     whole = track(recording, model=urdf)
-    parts = list(track_chunks(recording, model=urdf, chunk_s=6.0))
+    parts = list(track_chunks(Tracker(model=urdf), recording, 6.0))
     assert len(parts) > 1
     for name, values in whole.joints.items():
         np.testing.assert_array_equal(np.concatenate([part.joints[name] for part in parts]), values)

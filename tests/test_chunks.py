@@ -13,7 +13,7 @@ from commands import run
 
 from wepose_pin import Simulation, Subject, WeposeError, calibrate, simulate, track
 from wepose_pin.simulation import Person
-from wepose_pin.tracking import Tracker, TrackOptions, track_chunks
+from wepose_pin.tracking import Tracker, track_chunks
 from wepose_pin.writers import write_session
 
 
@@ -40,7 +40,7 @@ def subject(made: Simulation, person: Person) -> Subject:
 def test_chunks_put_together_are_the_whole(made: Simulation, subject: Subject, method: str, seconds: float) -> None:
     recording = made.recording()
     whole = track(recording, subject, method=method)
-    chunks = list(track_chunks(recording, subject, options=TrackOptions(method), chunk_s=seconds))
+    chunks = list(track_chunks(Tracker(subject, method=method), recording, seconds))
     assert len(chunks) > 2
     for part in ("quat_WL", "points"):
         for name, values in getattr(whole, part).items():
@@ -53,17 +53,16 @@ def test_chunks_put_together_are_the_whole(made: Simulation, subject: Subject, m
 
 
 def test_an_open_loop_in_chunks_is_the_whole(made: Simulation, subject: Subject) -> None:
-    options = TrackOptions(open_loop=True)
     whole = track(made.recording(), subject, open_loop=True)
-    chunks = list(track_chunks(made.recording(), subject, options=options, chunk_s=30.0))
+    chunks = list(track_chunks(Tracker(subject, open_loop=True), made.recording(), 30.0))
     for name, quat in whole.quat_WL.items():
         assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat)
 
 
 def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:
     recording = made.recording()
-    assert len(list(track_chunks(recording, options=TrackOptions("smoother"), chunk_s=5.0))) == 1
-    tracker = Tracker(options=TrackOptions("smoother"))
+    assert len(list(track_chunks(Tracker(method="smoother"), recording, 5.0))) == 1
+    tracker = Tracker(method="smoother")
     tracker.push(recording.cut(slice(0, 2000)))
     with pytest.raises(WeposeError, match="method 'smoother' takes the whole recording as one chunk"):
         tracker.push(recording.cut(slice(2000, 4000)))

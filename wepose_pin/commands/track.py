@@ -68,7 +68,7 @@ def track(
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..report.pages import write_track_pages
-    from ..tracking import CHUNK_S, SummaryAccumulator, TrackOptions, track_chunks
+    from ..tracking import CHUNK_S, SummaryAccumulator, Tracker, track_chunks
     from ..writers.provenance import collect_provenance, result_folder
     from ..writers.result import write_about, write_poses
 
@@ -87,13 +87,12 @@ def track(
                     person = parse_subject(log.header["subject"], session)
             else:
                 recording = load_session(session, gaps=gaps)
+            tracker = Tracker(person, model=model, method=chosen, causal=causal, open_loop=open_loop, limits=limits)
             chunks = track_chunks(
+                tracker,
                 recording,
-                person,
-                model=model,
-                options=TrackOptions(chosen, causal=causal, open_loop=open_loop, limits=limits),
-                chunk_s=float("inf") if torques else CHUNK_S,
-                progress=lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
+                float("inf") if torques else CHUNK_S,
+                lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
             )
             accumulator = SummaryAccumulator(recording)
             write_poses(folder, accumulator.accumulate(chunks), covariance)

@@ -225,7 +225,14 @@ class FilteredRecording(NamedTuple):
 def filter_recording(
     recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
 ) -> FilteredRecording:
-    """Filter every sensor, and check that the start pose is static.
+    """Filter every sensor, and check that the start pose is static; parameters and errors as of `start_filters`."""
+    return start_filters(recording, method=method, static_test=static_test, sways=sways)[1]
+
+
+def start_filters(
+    first: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
+) -> tuple[SensorFilters, FilteredRecording]:
+    """Filter the first chunk of a recording, which contains the start pose; the filters take the next ones.
 
     Parameters
     ----------
@@ -234,25 +241,14 @@ def filter_recording(
     Raises
     ------
     WeposeError
-        A start phase with too few samples; an unknown method.
+        A start phase with too few samples, or with motion; an unknown method.
     """
-    phases = find_reference_phases(recording, sways)
-    start = recording.span(phases.start)
-    orientation = SensorFilters(phases.noises, method=method, static_test=static_test, start=start).push(recording)
-    R_VS = {
-        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_VS)
-        for segment, sensor in recording.sensors.items()
-    }
-    R_VS_start = find_start_orientations(recording, orientation, phases.start)
-    return FilteredRecording(R_VS, R_VS_start, orientation, phases.start, phases.static, phases.diagnostics)
-
-
-def find_start_orientations(
-    first: Recording, orientation: Mapping[str, Orientation], start: tuple[float, float]
-) -> dict[str, Rotation]:
-    """Find segment → mean orientation of its sensor in the start pose `start` [s], from a chunk that contains it."""
-    R_VS_start = {}
+    phases = find_reference_phases(first, sways)
+    span = first.span(phases.start)
+    filters = SensorFilters(phases.noises, method=method, static_test=static_test, start=span)
+    orientation, R_VS, R_VS_start = filters.push(first), {}, {}
     for segment, sensor in first.sensors.items():
-        source = sensor if isinstance(sensor, OrientationSensor) else orientation[segment]
-        R_VS_start[segment] = Rotation.from_quat(source.quat_VS[first.find_measured(segment, start)]).mean()
-    return R_VS_start
+        quat_VS = (sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_VS
+        R_VS[segment] = Rotation.from_quat(quat_VS)
+        R_VS_start[segment] = R_VS[segment][first.find_measured(segment, phases.start)].mean()
+    return filters, FilteredRecording(R_VS, R_VS_start, orientation, phases.start, phases.static, phases.diagnostics)

@@ -7,7 +7,7 @@ import itertools
 import math
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +29,8 @@ from ..readers.live_log import LONGEST_TEXT, build_recording
 from ..recording import ImuSensor, Recording
 from ..recording.arrivals import COUNTS, CUT_OFF, MISSING, Samples, Ticks
 from ..recording.plausibility import find_unseen_rate
-from ..tracking import Tracker, TrackOptions
+from ..tracking import Tracker
 from ..tracking.heading_problem import CAUSAL_KNOT_S
-from ..tracking.segments import SegmentEstimator
 from ..writers.live_log import LiveLog, check_absent
 from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts
@@ -96,8 +95,8 @@ class LiveLoop(Stage):
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
         self._soft_tissue = SoftTissueCorrection(self.model.table, self.model.tissue_means, tuple(source.sensors))
         self._soft_tissue.correct(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
-        self._tracker = Tracker(setup.subject, model=self.model, options=TrackOptions(method, causal=True))
-        self._estimator: SegmentEstimator | None = None  # from when the start pose is found
+        self._tracker = Tracker(setup.subject, model=self.model, method=method, causal=True)
+        self._estimator: Tracker | None = None  # from when the start pose is found
         self._header = setup.header(source.sensors, source.orientations)
         further = {"method": method, "subject": subject_text, "versions": versions()}
         self.log = LiveLog(None if record is None else Path(record), self._header | further, force)
@@ -108,7 +107,6 @@ class LiveLoop(Stage):
         edges = [(first - 1e-9, name, True) for name, first, _ in spans]
         self._edges = deque(sorted(edges + [(last + 1e-9, name, False) for name, _, last in spans]))
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
-        self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
         self._latency: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s]
         self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
         self._open_phases: dict[str, str] = {}  # name of the action that began it and ends it → phase
@@ -193,26 +191,26 @@ class LiveLoop(Stage):
         with_sample = ~ticks.lost[row:].all(axis=1)  # a tick of silent sensors is not late
         self._latency += (now - ticks.time[row:][with_sample]).tolist()
         quat_WL = self.kinematics.orient_segments(quat_WL).copy()
-        return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), now - self._last_pose)
+        return LivePose(
+            self._last_pose, quat_WL, points, self._std.copy(), ticks.lost[-1].copy(), now - self._last_pose
+        )
 
-    def _update_std(self, estimator: SegmentEstimator, tick: int) -> None:
-        """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
-        period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))  # ticks from one to the next
-        if tick % period == 0:
-            self._covariance = estimator.covariance_gradually()
-        for covariance in itertools.islice(self._covariance, math.ceil((len(self._std) + 2) / period)):
-            if covariance is not None:
-                self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
+    def _update_std(self, estimator: Tracker, tick: int) -> None:
+        """Compute the covariances of the segments whose turn it is; by ticks, so that a recording reproduces them."""
+        period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))  # ticks from one turn to the next
+        for i in range(len(self._std)):
+            if i * period // len(self._std) == tick % period:
+                covariance = estimator.compute_covariance(i)
+                self._std[i], self._heading_std[i] = compute_axis_std(covariance[None])[0], np.sqrt(covariance[2, 2])
 
-    def _start_tracking(self, begin: int, end: int) -> SegmentEstimator:
+    def _start_tracking(self, begin: int, end: int) -> Tracker:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
         assert self._search is not None
         rate_hz = self._stream.clock.rate_hz
         recording = build_recording(self._header, rate_hz, self._search.ticks, (begin, end), last=end)
         diagnostics = check_units(recording, self.source)
-        self._tracker.push(recording)
-        estimator = self._tracker.segment_estimator
-        assert estimator is not None
+        estimator = self._tracker
+        estimator.push(recording)
         self._search.ticks, self._monitor.keeps_samples = [], False
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])

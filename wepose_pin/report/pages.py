@@ -6,7 +6,7 @@ import shutil
 import sys
 import tempfile
 import webbrowser
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -52,11 +52,10 @@ def save_result(result: TrackResult, folder: str | Path, force: bool = False) ->
                 if file.is_file():
                     shutil.copyfile(file, partial / file.name)
             return out
-        summary, options = summarize(result), result.options
+        summary = summarize(result)
         # Inputs and options of `track`, under the names that they have in `wepose track`.
         inputs = {"session": result.recording.source, "subject": result.subject.name, "model": result.model.table.name}
-        inputs |= {each.name: getattr(options, each.name) for each in fields(options)}
-        write_result(partial, result, summary, provenance=collect_provenance(CALL, inputs))
+        write_result(partial, result, summary, provenance=collect_provenance(CALL, inputs | dict(result.options)))
     write_track_pages(out, summary)
     return out
 

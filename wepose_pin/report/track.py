@@ -115,7 +115,7 @@ def _describe_reliance(tracked: TrackResult, measures: TrackSummary, angles: Ang
 
 
 def _explain_no_covariance(tracked: TrackResult) -> str:
-    source = f"The filter {tracked.options.method}" if tracked.recording.imus else "The device"
+    source = f"The filter {tracked.options['method']}" if tracked.recording.imus else "The device"
     return (
         f"{source} states no uncertainty, so this page cannot say how far angles and positions may be off. The methods "
         "amekf, smoother, smekf and smekf_published state it."
@@ -253,7 +253,7 @@ def _tabulate_run(tracked: TrackResult) -> Table:
     recording, subject = tracked.recording, tracked.subject
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("filter", tracked.options.method if tracked.segments.orientation else "none: measured orientations"),
+        ("filter", tracked.options["method"] if tracked.segments.orientation else "none: measured orientations"),
         ("start pose", f"{recording.start_pose.replace('_', '-')}, {intervals([tracked.segments.start])}"),
         ("static phase", intervals([tracked.segments.static_phase])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),

@@ -18,7 +18,6 @@ from ..filters import BEST
 from ..filters.static import StaticTest
 from ..recording import Recording
 from .result import TrackResult
-from .segment_orientations import TrackOptions
 from .summary import SummaryAccumulator, TrackSummary, summarize
 from .tracker import CHUNK_S, Tracker, track_chunks
 
@@ -30,7 +29,6 @@ else:  # checked as the subject that it has; the room of calibrations loads slow
 __all__ = [
     "CHUNK_S",
     "SummaryAccumulator",
-    "TrackOptions",
     "TrackResult",
     "TrackSummary",
     "Tracker",
@@ -106,7 +104,15 @@ def track(
     check_arguments(track, locals() | {"subject": person})
     if person is not None and not accept_failed:
         person.check_quality()
-    options = TrackOptions(method, static_test, open_loop, causal, limits)
-    [result] = track_chunks(recording, person, model=model, options=options, chunk_s=np.inf)
+    tracker = Tracker(
+        person,
+        model=model,
+        method=method,
+        static_test=static_test,
+        open_loop=open_loop,
+        causal=causal,
+        limits=limits,
+    )
+    [result] = track_chunks(tracker, recording, np.inf)
     summary = summarize(result)
     return replace(result, summary=summary.content, diagnostics=summary.diagnostics)

@@ -8,7 +8,7 @@ Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is correct
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -16,12 +16,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..body.mounts import StartPose, compute_start_heading_var
 from ..filters.butterworth import BandPass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
 from .heading_filter import HeadingFilter, symmetric
 from .heading_problem import HeadingProblem
-from .segment_orientations import SegmentOrientations, correct_covariance
 
 E_Z = np.array([0.0, 0.0, 1.0])
 # Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
@@ -57,26 +55,14 @@ class HeadingCorrection:
             "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
         }
 
-    def correct(self, orientations: SegmentOrientations) -> SegmentOrientations:
-        """Return a chunk's orientations with corrected headings, of a correction that is interpolated between knots."""
-        chunk, subject = orientations.recording, self.problem.subject
-        start_pose = StartPose(table=self.problem.model.table)
-        corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
-        for i, name in enumerate(self.segments):
-            delta = np.interp(chunk.time, self.time, self.errors[:, i])
-            corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
-            filtered = orientations.orientation.get(name)
-            if filtered is not None and filtered.attitude_cov is not None:
-                known = np.interp(chunk.time, self.time, self.segment_covariance[:, i, i])
-                covariance[name] = correct_covariance(
-                    covariance[name],
-                    (filtered.quat_VS, filtered.attitude_cov),
-                    np.array([orientations.heading_offset[name]]),
-                    compute_start_heading_var(chunk, name, subject, start_pose),
-                    np.stack([known, np.full(len(delta), np.inf), delta**2], axis=1),
-                    chunk.sensors[name].gap,
-                )
-        return replace(orientations, quat_WL=corrected, covariance_W=covariance)
+    def interpolate(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corrections (n, k) [rad] and the variances (n, k) [rad²] of segments' headings at times [s]."""
+        variances = np.diagonal(self.segment_covariance, axis1=1, axis2=2)
+        corrections, known = (
+            np.column_stack([np.interp(time, self.time, values) for values in at_knots.T])
+            for at_knots in (self.errors, variances)
+        )
+        return corrections, known
 
     def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
         """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""

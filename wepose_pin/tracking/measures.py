@@ -25,7 +25,7 @@ from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.sensors import compute_rate
 from .result import TrackResult
-from .segment_orientations import compute_heading_variance, compute_soft_tissue_covariances
+from .segment_orientations import compute_heading_variance, compute_soft_tissue_covariance
 
 PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
 PERIOD_S = 1.0  # [s] from one sample of the error budget to the next
@@ -190,10 +190,10 @@ def compute_error_budget(tracked: TrackResult) -> dict[str, dict[str, float]]:
     exact = compute_variances(zero, none)  # what leaves the law of the girdles
     with_girdles, with_lengths = compute_variances(zero, of_girdles), compute_variances(zero, shape_cov)
     independent = compute_variances(total, shape_cov)
-    soft = compute_soft_tissue_covariances(correct_table(body.table, body.tissue_means), quat_WL)
+    table = correct_table(body.table, body.tissue_means)
     parts = {point: {GIRDLES: value, LENGTHS: with_lengths[point] - value} for point, value in with_girdles.items()}
     for name in total:
-        own_soft = compute_variances({**zero, name: soft[name]}, none)
+        own_soft = compute_variances({**zero, name: compute_soft_tissue_covariance(table, quat_WL, name)}, none)
         both = compute_variances({**zero, name: total[name]}, none)
         for point, own in parts.items():
             own[f"{name}: {SOFT_TISSUE}"] = own_soft[point] - exact[point]

@@ -20,7 +20,7 @@ from ..diagnostics import WARNING, Diagnostic, notebook_html
 from ..errors import BadData, Named, WeposeError, how_to_install
 from ..recording import Intervals, Mark, Recording
 from .headings import HeadingCorrection
-from .segment_orientations import SegmentOrientations, TrackOptions
+from .segment_orientations import SegmentOrientations
 
 if TYPE_CHECKING:
     import pandas
@@ -93,8 +93,8 @@ class TrackResult:
         return self.segments.recording
 
     @property
-    def options(self) -> TrackOptions:
-        """How it was tracked. Raises as `segments`."""
+    def options(self) -> Mapping[str, Any]:
+        """How it was tracked: `method` and others of `track` by their names. Raises as `segments`."""
         return self.segments.options
 
     def check(self) -> TrackResult:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,27 +14,9 @@ from ..body import BodyTable
 from ..body.mounts import StartPose, compute_start_heading_var, find_mount_covariance
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
-from ..errors import BadOption
-from ..filters import BEST, OFFLINE, Orientation, check_method
+from ..filters import Orientation
 from ..filters.noise import ACCEL_BIAS_STD
-from ..filters.static import StaticTest
 from ..recording import Recording
-
-
-@dataclass(frozen=True)
-class TrackOptions:
-    """What is chosen for a `Tracker`, beside the person and the body model; each as in `track`."""
-
-    method: str = BEST
-    static_test: StaticTest | None = None
-    open_loop: bool = False
-    causal: bool = False
-    limits: bool = True
-
-    def __post_init__(self) -> None:
-        check_method(self.method)
-        if self.causal and self.method in OFFLINE:
-            raise BadOption(f"method '{self.method}' needs the whole recording; 'amekf' looks at nothing ahead")
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,7 +24,7 @@ class SegmentOrientations:
     """Orientation of each measured segment of a recording, or of a chunk of one."""
 
     recording: Recording  # the input, n samples; of a causal tracker the part after the start pose
-    options: TrackOptions  # how it was tracked
+    options: Mapping[str, Any]  # how it was tracked, as `Tracker.options`
     quat_WL: Mapping[str, np.ndarray]  # segment → (n, 4) xyzw
     quat_LS: Mapping[str, np.ndarray]  # segment → (4,) xyzw, the mount used
     heading_offset: Mapping[str, float]  # segment → ψ [rad], heading of its sensor's world V in W
@@ -54,7 +37,7 @@ class SegmentOrientations:
     diagnostics: tuple[Diagnostic, ...]  # of the recording, its start pose and its mounts
 
     def __repr__(self) -> str:
-        return f"SegmentOrientations({self.recording!r}, {self.options.method})"
+        return f"SegmentOrientations({self.recording!r}, {self.options['method']})"
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
@@ -145,24 +128,24 @@ def correct_covariance(
     return replaced
 
 
-def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute segment → covariance (n, 3, 3) [rad²] in W by which soft tissue turns its sensor in motion."""
-    covariances, elevation, relative = {}, {}, {}
-    for segment, quat in quat_WL.items():
-        own = table.segments[segment]
-        along, below = np.array(own.along), quat_WL.get(own.soft_tissue.relative_to)
-        relative[segment] = quat if below is None else rotations.multiply(rotations.conjugate(below), quat)
-        turned = Rotation.from_quat(relative[segment]).as_matrix() @ along
-        elevation[segment] = np.arccos(np.clip(turned @ along, -1.0, 1.0))
-    for segment, quat in quat_WL.items():
-        tissue, along = table.segments[segment].soft_tissue, np.array(table.segments[segment].along)
-        var = np.square(tissue.std) + np.square(np.outer(elevation[segment], tissue.per_tilt))
-        if raised := [elevation[other] for other in tissue.raised if other in elevation]:
-            var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
-        if tissue.per_twist and tissue.relative_to in quat_WL:
-            x_y_z, w = relative[segment][:, :3], relative[segment][:, 3]
-            twist = 2.0 * np.arctan2(np.abs(x_y_z @ along), np.abs(w))
-            var = var + np.square(np.outer(tissue.per_twist * twist, along))
-        matrix = Rotation.from_quat(quat).as_matrix()
-        covariances[segment] = (matrix * var[:, None, :]) @ matrix.swapaxes(1, 2)
-    return covariances
+def compute_soft_tissue_covariance(table: BodyTable, quat_WL: Mapping[str, np.ndarray], segment: str) -> np.ndarray:
+    """Compute the covariance (n, 3, 3) [rad²] in W by which soft tissue turns a segment's sensor in motion."""
+    tissue, along = table.segments[segment].soft_tissue, np.array(table.segments[segment].along)
+    var = np.square(tissue.std) + np.square(np.outer(_elevate(table, quat_WL, segment), tissue.per_tilt))
+    if raised := [_elevate(table, quat_WL, other) for other in tissue.raised if other in quat_WL]:
+        var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
+    if tissue.per_twist and tissue.relative_to in quat_WL:
+        relative = rotations.multiply(rotations.conjugate(quat_WL[tissue.relative_to]), quat_WL[segment])
+        twist = 2.0 * np.arctan2(np.abs(relative[:, :3] @ along), np.abs(relative[:, 3]))
+        var = var + np.square(np.outer(tissue.per_twist * twist, along))
+    matrix = Rotation.from_quat(quat_WL[segment]).as_matrix()
+    return np.asarray((matrix * var[:, None, :]) @ matrix.swapaxes(1, 2))
+
+
+def _elevate(table: BodyTable, quat_WL: Mapping[str, np.ndarray], segment: str) -> np.ndarray:
+    """Return the angle (n,) [rad] of a segment's long axis from where it is in the start pose."""
+    own = table.segments[segment]
+    quat, below = quat_WL[segment], quat_WL.get(own.soft_tissue.relative_to)
+    relative = quat if below is None else rotations.multiply(rotations.conjugate(below), quat)
+    along = np.array(own.along)
+    return np.asarray(np.arccos(np.clip(Rotation.from_quat(relative).as_matrix() @ along @ along, -1.0, 1.0)))

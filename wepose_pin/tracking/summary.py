@@ -186,8 +186,8 @@ class SummaryAccumulator:
         content = {
             "recording": last.recording.name,
             "session": str(last.recording.source) if last.recording.source else None,
-            "method": last.options.method if segments.orientation else "measured orientations",
-            "causal": last.options.causal,
+            "method": last.options["method"] if segments.orientation else "measured orientations",
+            "causal": last.options["causal"],
             "model": last.model.robot.name,
             "subject": {"name": last.subject.name, "note": last.subject.note},
             "samples": self._samples,
@@ -279,5 +279,5 @@ def _diagnose_signal(tracked: TrackResult, name: str, signal: Signal) -> Iterato
     if signal.static is not None:
         share, seconds = float(signal.static.mean()), longest_run_s(~signal.static, rate_hz)
         if seconds > LONG_MOTION_S or share < LITTLE_STATIC:
-            severity = WARNING if tracked.options.method in STATIC_ONLY else INFO
+            severity = WARNING if tracked.options["method"] in STATIC_ONLY else INFO
             yield Diagnostic("static-phases-rare", severity, name, share, LITTLE_STATIC, {"longest": seconds})
