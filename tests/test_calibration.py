@@ -68,7 +68,7 @@ def test_all_mounts_share_the_heading_of_a_start_pose_in_which_the_arms_are_rais
     )
     phases = {**recording.phases, "start": recording.phases["t_pose"]}
     calibration = calibrate(replace(recording, phases=phases, start_pose="t_pose"))
-    subject, start_pose = calibration.subject, calibration.problem.start_pose
+    subject, start_pose = calibration.subject, calibration.problem.layout.start_pose
     up = {name: start_pose.rotation(name)[2] for name in subject.mounts}
     assert abs(up["left_upper_arm"][2]) < 0.1
     for name in subject.mounts:

@@ -1,11 +1,10 @@
 """Link lengths, mounts and headings from hands held together, or from another protocol.
 
 `procedure` is the calibration from a recording to a subject, step by step. `protocols` describes what a person does,
-`conditions` what follows for a body, `problem` collects inputs and samples. `equations` has the unknowns and residuals
-in CasADi, `priors` what is known before, `least_squares` the problem and its solution by `nlpsol`. `initial_headings`
-searches headings without an initial guess, and `couplings` has what accelerations observe of them. `weights` weighs the
-samples. `solution` compares other minima and makes a `result`. `quality` assesses it. `paper` is the published
-calibration of the lengths alone.
+`conditions` what follows for a body, `problem` collects inputs and samples. `equations` has the unknowns, the residuals
+in CasADi and the prior, `least_squares` the solution by `nlpsol`. `initial_headings` searches headings without an
+initial guess, and `couplings` has what accelerations observe of them. `weights` weighs the samples. `solution` makes a
+`result`, and `quality` assesses it. `paper` is the published calibration of the lengths alone.
 """
 
 from .paper import Formulation

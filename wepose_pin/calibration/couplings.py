@@ -18,8 +18,7 @@ from ..filters.sensors import FilteredRecording
 from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, linearize_joint
 from ..recording import Recording
 from .conditions import find_connected, find_samples, mask_measured
-from .equations import Layout
-from .least_squares import Gaussian
+from .equations import Gaussian, Layout
 
 SAMPLES_HZ = 10.0
 # Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual

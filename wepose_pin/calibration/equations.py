@@ -2,7 +2,7 @@
 
     minimise  ½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c),   no length below `MIN_LENGTH`
 
-with the prior c, Λ of `priors` and the weights w of `weights`.
+with the prior c, Λ of `build_prior` and the weights w of `weights`.
 
 For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. Here L is
 the frame of its segment that equals W in the start pose (L' in `observations`). With a start pose that is ε off the
@@ -16,126 +16,173 @@ long axis by g times the twist that its sensor shows. A segment's points may mov
 and shoulder blades while the arms are raised (`body.girdle`). d, A, g and the hinges are nuisance parameters: the
 covariance of lengths and mounts includes their effect.
 
-Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
-errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
-leaves its plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual. A
-stated pose (`Pointing`) gives the deviation of a segment from its direction, an axis (`Level`) how far it rises while
-the segment bends. Each sample has the same residuals: three of its condition and one a hinge; those that do not apply
-are zero.
+Each sample belongs to one condition of the protocol. A closure gives the gap, whitened by the covariance that errors of
+the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves leaves its
+plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual. A `Direction`
+gives the deviation of a segment from it, an `Axis` how far it rises while the segment bends. Each sample has the same
+residuals: three of its condition and one a hinge; those that do not apply are zero.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
-from ..body import BodyTable
+from ..body import BodyModel
 from ..body.girdle import PARAMETERS
+from ..body.mounts import find_start_pose
 from ..body.soft_tissue import LEAST_TWIST_COSINE
-from ..body.table import Vector
+from ..body.subject import Subject
+from ..errors import BadSubject
 from ..observations.expressions import (
-    GirdleTerm,
-    HingePlane,
+    ZERO_LENGTH,
     about_z,
     express_covariance,
-    express_path,
+    find_girdles,
+    find_hinges,
     product,
+    rotate,
     rotate_back,
     small_rotation,
 )
-from .conditions import Constraint, Level, Loop, Pointing
-from .protocols import FreeMotion
+from ..recording import Recording
+from .conditions import resolve_conditions
+from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 
-HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
 GAP_ROWS = 3  # residuals of a sample's condition
+HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
+# [rad] of orientations, of which only ratios matter: arms 60 deg off hanging, as hands are joined before the chest, and
+# links where nothing is soft.
+USUAL_ELEVATION, RIGID_ATTITUDE_STD = np.deg2rad(60.0), np.deg2rad(1.5)
+# Standard deviations of the prior.
+DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
+LEAST_FOAM_STD = 1e-4  # [rad/rad] about an axis about which a table states that no foam gives
+LEAST_GIRDLE_STD = 1e-5  # [m] of a parameter that a table states as exact
+POINT_STD = 3.0  # [m] of an unknown point of W
+
+Gaussian = tuple[np.ndarray, np.ndarray]  # a normal distribution of x: mean (m,) and information (m, m)
 
 
-# A segment's rotation about its long axis (3,) in L', against the segment above, both with a sensor: the segment, the
-# one above, the axis, and how far sensors lag behind it, one standard deviation [rad/rad] per angle that they show.
-Twist = tuple[str, str, Vector, float]
+# Unknowns -------------------------------------------------------------------------------------------------------------
 
 
-def find_twists(table: BodyTable, hinges: Sequence[HingePlane], sensors: Sequence[str]) -> tuple[Twist, ...]:
-    """Find the twists that hinges show: of the segments above them."""
-    tissues = [(hinge, table.segments[hinge.on].soft_tissue) for hinge in hinges]
-    return tuple(
-        (hinge.on, tissue.relative_to, hinge.along_on, tissue.per_twist)
-        for hinge, tissue in tissues
-        if tissue.per_twist and tissue.relative_to in sensors
-    )
-
-
-@dataclass(frozen=True)
 class Layout:
-    """The unknowns, each with its places in x, and the data of a sample."""
+    """The unknowns of a protocol on a body, each with its places in x (m,); raise as `resolve_conditions`."""
 
-    lengths: tuple[str, ...]  # names, in the order of the table
-    sensors: tuple[str, ...]  # their segments, in the order of the table
-    hinges: tuple[HingePlane, ...] = ()  # between segments of these sensors
-    girdles: tuple[GirdleTerm, ...] = ()
-    twists: tuple[Twist, ...] = ()  # of the segments above the hinges
-    fixed: int = 0  # number of fixed points
-    planes: int = 0  # number of level planes of unknown height
-    recorded: bool = False  # the samples have a recorded place
-    attitude_std: tuple[float, ...] = ()  # [rad] of each orientation about an axis across its segment; ratios matter
-    soft: tuple[str, ...] = ()  # sensors on a foam
+    length: np.ndarray  # (lengths,) [m]
+    heading: np.ndarray  # (sensors,) ψ [rad]
+    tilt: np.ndarray  # (sensors, 2) ε about x and y of L [rad]
+    drift: np.ndarray  # (sensors,) d [rad/s]
+    hinge: np.ndarray  # (hinges, 2) of its axis along `across` and `tilted`
+    foam: np.ndarray  # (soft, 9) A [rad], column by column
+    twist: np.ndarray  # (twists,) g
+    girdle: np.ndarray  # (girdles, 7) `body.girdle.PARAMETERS`
+    point: np.ndarray  # (fixed points, 3) of W [m]
+    height: np.ndarray  # (planes,) of W [m]
 
-    # The places of each unknown in x, and their number; set below.
-    length = heading = tilt = drift = hinge = foam = twist = girdle = point = height = np.empty(0, dtype=int)
-    size = 0
-
-    def __post_init__(self) -> None:
-        sensors, begin = len(self.sensors), 0
+    def __init__(self, protocol: Protocol, model: BodyModel, recording: Recording) -> None:
+        self.protocol, self.model, table = protocol, model, model.table
+        self.start_pose = find_start_pose(model, recording)
+        self.conditions, self.paths = resolve_conditions(protocol, model, self.start_pose, recording)
+        used = {segment for paths in self.paths.values() for path in paths for segment in path.segments}
+        for condition in self.conditions:
+            if isinstance(condition, FreeMotion):
+                used |= set(recording.sensors)
+            elif isinstance(condition, Direction | Axis):
+                used |= {condition.segment, condition.reference if isinstance(condition, Direction) else ""}
+        self.sensors = tuple(name for name in table.segments if name in used)  # their segments
+        self.lengths = tuple(model.lengths)
+        self.hinges = find_hinges(model, self.start_pose, self.sensors)
+        self.girdles = find_girdles(model, self.sensors)
+        tissues = {name: table.segments[name].soft_tissue for name in self.sensors}
+        # Hinges that show how the segment above them twists against the one above that, both with sensors.
+        twisting = [name for name, own in tissues.items() if own.per_twist and own.relative_to in self.sensors]
+        self.twists = [hinge for hinge in self.hinges if hinge.on in twisting]
+        self.soft = [name for name in self.sensors if any(table.segments[name].foam_std)]  # sensors on a foam
+        self.attitude_std = dict[str, float]()  # [rad] of each orientation about an axis across its segment
+        for name, tissue in tissues.items():
+            growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
+            std = float(np.sqrt(np.mean(np.square(tissue.std) + growth**2)))
+            self.attitude_std[name] = std or RIGID_ATTITUDE_STD
+        kinds = {kind: [c for c in self.paths if c.kind == kind] for kind in ("fixed_point", "plane", "recorded")}
         shapes = {
-            "length": (len(self.lengths),),  # [m]
-            "heading": (sensors,),  # ψ [rad]
-            "tilt": (sensors, 2),  # ε about x and y of L [rad]
-            "drift": (sensors,),  # d [rad/s]
-            "hinge": (len(self.hinges), 2),  # of its axis along `across` and `tilted`
-            "foam": (len(self.soft), 9),  # A [rad], column by column
-            "twist": (len(self.twists),),  # g
-            "girdle": (len(self.girdles), len(PARAMETERS)),  # `body.girdle.PARAMETERS`
-            "point": (self.fixed, 3),  # of W [m]
-            "height": (self.planes,),  # of W [m]
+            "length": (len(self.lengths),),
+            "heading": (len(self.sensors),),
+            "tilt": (len(self.sensors), 2),
+            "drift": (len(self.sensors),),
+            "hinge": (len(self.hinges), 2),
+            "foam": (len(self.soft), 9),
+            "twist": (len(self.twists),),
+            "girdle": (len(self.girdles), len(PARAMETERS)),
+            "point": (len(kinds["fixed_point"]), 3),
+            "height": (len(kinds["plane"]),),
         }
+        self.size = 0  # m
         for name, shape in shapes.items():
-            places = begin + np.arange(np.prod(shape, dtype=int)).reshape(shape)
-            object.__setattr__(self, name, places)
-            begin += places.size
-        object.__setattr__(self, "size", begin)
+            places = self.size + np.arange(np.prod(shape, dtype=int)).reshape(shape)
+            setattr(self, name, places)
+            self.size += places.size
+        # Closure → the places of its point or height.
+        self.unknown = dict(zip((*kinds["fixed_point"], *kinds["plane"]), (*self.point, *self.height), strict=True))
+        # Of a sample's data: Q of each sensor xyzw, the recorded place (3,) [m] in W where there is one, and the time.
+        self.place = slice(4 * len(self.sensors), 4 * len(self.sensors) + (3 if kinds["recorded"] else 0))
+        self.residuals = GAP_ROWS + len(self.hinges)  # of a sample
+
+    @cached_property
+    def length_groups(self) -> dict[str, tuple[str, ...]]:
+        """Sensor → the lengths that rotate with it in some closure, which observes sums of those in one direction."""
+        groups: dict[str, dict[str, None]] = {}
+        for segment, (B, _) in [each for paths in self.paths.values() for p in paths for each in p.vectors.items()]:
+            moved = np.abs(B).max(axis=0) > ZERO_LENGTH
+            names = [name for name, moves in zip(self.lengths, moved, strict=True) if moves]
+            groups.setdefault(segment, {}).update(dict.fromkeys(names))
+        return {sensor: tuple(names) for sensor, names in groups.items() if names}
 
     @property
-    def place(self) -> slice:
-        """Of a sample's data: the recorded place (3,) [m] in W."""
-        return slice(4 * len(self.sensors), 4 * len(self.sensors) + 3 * self.recorded)
+    def lengths_in_closures(self) -> tuple[str, ...]:
+        """The names of the lengths that some closure contains."""
+        inside = {name for group in self.length_groups.values() for name in group}
+        return tuple(name for name in self.lengths if name in inside)
 
     @property
-    def residuals(self) -> int:
-        """Number of residuals of a sample."""
-        return GAP_ROWS + len(self.hinges)
+    def scale_observed(self) -> bool:
+        """Whether the closures determine the scale: by a recorded or known place, or by a link of known size."""
+        return any(
+            closure.kind == "recorded"
+            or closure.at is not None
+            or any(c.any() for p in paths for _, c in p.vectors.values())
+            for closure, paths in self.paths.items()
+        )
+
+    @cached_property
+    def functions(self) -> dict[Condition, tuple[ca.Function, ca.Function]]:
+        """Condition → two functions of x (m,) and a sample's data (rows,).
+
+        The first gives its residuals (k,) and its gap (3,) [m], zero without a closure; the second the Jacobian of the
+        residuals, transposed (m, k).
+        """
+        return {condition: _express_residuals(self, condition) for condition in self.conditions}
 
 
-@lru_cache(maxsize=32)
-def sample_functions(layout: Layout, condition: Constraint) -> tuple[ca.Function, ca.Function]:
-    """Return two functions of x (m,) and a sample's data (rows,).
+# Residuals ------------------------------------------------------------------------------------------------------------
 
-    The first gives its residuals (k,) and its gap (3,) [m], zero without a closure; the second the Jacobian of the
-    residuals, transposed (m, k).
-    """
+
+def _express_residuals(layout: Layout, condition: Condition) -> tuple[ca.Function, ca.Function]:
     x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.place.stop + 1)
     quat_WL = _orient_segments(layout, x, data)
     r, gap, hinges = ca.SX.zeros(GAP_ROWS), ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
-    if isinstance(condition, Loop):
-        r, gap = _closure_residual(layout, condition, quat_WL, x, data[layout.place])
-    elif isinstance(condition, Pointing):
-        r = condition.residual(quat_WL)
-    elif isinstance(condition, Level):
-        r[0] = condition.residual(quat_WL, _start_rotation(layout, x, condition.segment))
-    if isinstance(condition, Loop | FreeMotion):
+    if isinstance(condition, Closure):
+        r, gap = _express_closure(layout, condition, quat_WL, x, data[layout.place])
+    elif isinstance(condition, Direction):
+        along_W = rotate(quat_WL[condition.segment], condition.along)
+        r = (rotate_back(quat_WL[condition.reference], along_W) - ca.DM(condition.direction)) / condition.std
+    elif isinstance(condition, Axis):
+        start = _start_rotation(layout, x, condition.segment)
+        r[0] = (rotate(quat_WL[condition.segment], condition.axis) - rotate(start, condition.axis))[2] / condition.std
+    if isinstance(condition, Closure | FreeMotion):
         for i, hinge in enumerate(layout.hinges):
             error = x[layout.hinge[i]]
             hinges[i] = hinge.deviation(quat_WL[hinge.on], quat_WL[hinge.moves], error) / HINGE_STD
@@ -155,40 +202,99 @@ def _orient_segments(layout: Layout, x: ca.SX, data: ca.SX) -> dict[str, ca.SX]:
             A = ca.reshape(x[layout.foam[layout.soft.index(name)]], 3, 3)
             quat = product(quat, small_rotation(A @ (rotate_back(quat, up) - up)))
         quat_WL[name] = quat
-    for (name, above, along, _), lag in zip(layout.twists, ca.vertsplit(x[layout.twist]), strict=True):
-        relative = product(ca.vertcat(-quat_WL[above][:3], quat_WL[above][3]), quat_WL[name])
-        part, w = ca.dot(relative[:3], ca.DM(along)), relative[3]
+    for hinge, lag in zip(layout.twists, ca.vertsplit(x[layout.twist]), strict=True):
+        name, along = hinge.on, ca.DM(hinge.along_on)
+        above = quat_WL[layout.model.table.segments[name].soft_tissue.relative_to]
+        relative = product(ca.vertcat(-above[:3], above[3]), quat_WL[name])
+        part, w = ca.dot(relative[:3], along), relative[3]
         sine = 2.0 * part * w / ca.fmax(part**2 + w**2, LEAST_TWIST_COSINE)
-        quat_WL[name] = product(quat_WL[name], small_rotation(lag * sine * ca.DM(along)))
+        quat_WL[name] = product(quat_WL[name], small_rotation(lag * sine * along))
     return quat_WL
 
 
 def _start_rotation(layout: Layout, x: ca.SX, segment: str) -> ca.SX:
     """Return exp(ε) (4,) of a segment."""
-    tilt = x[layout.tilt[layout.sensors.index(segment)]]
-    return small_rotation(ca.vertcat(tilt, 0.0))
+    return small_rotation(ca.vertcat(x[layout.tilt[layout.sensors.index(segment)]], 0.0))
 
 
-def _closure_residual(
-    layout: Layout, loop: Loop, quat_WL: Mapping[str, ca.SX], x: ca.SX, recorded: ca.SX
+def _express_closure(
+    layout: Layout, closure: Closure, quat_WL: Mapping[str, ca.SX], x: ca.SX, recorded: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Return the whitened residual (3,) and the gap (3,) [m] of a closure; `recorded` (3,) [m] is a recorded place."""
-    attitude_std = dict(zip(layout.sensors, layout.attitude_std, strict=True))
-    girdles = {g.name: (g, x[own]) for g, own in zip(layout.girdles, layout.girdle, strict=True)}
-    gaps, covariances = [], []
-    for path in loop.paths:
-        gap, vectors = express_path(path, quat_WL, x[layout.length], girdles)
-        gaps.append(gap)
-        covariances.append(express_covariance(vectors, loop.closure.slip, attitude_std))
-    if loop.kind == "plane":
-        off, r = ca.SX.zeros(3), ca.SX.zeros(GAP_ROWS)
-        for k, (gap, covariance) in enumerate(zip(gaps, covariances, strict=True)):
-            off[k] = gap[2] - x[layout.height[loop.unknown]]
+    """Return the whitened residual (3,) and the gap (3,) [m]; `recorded` (3,) [m] is a recorded place."""
+    girdles = {name: x[own] for name, own in zip(layout.girdles, layout.girdle, strict=True)}
+    off, r = ca.SX.zeros(3), ca.SX.zeros(GAP_ROWS)
+    for k, path in enumerate(layout.paths[closure]):
+        gap, vectors = path.express(quat_WL, x[layout.length], girdles)
+        covariance = express_covariance(vectors, closure.slip, layout.attitude_std)
+        if closure.kind == "plane":
+            off[k] = gap[2] - x[layout.unknown[closure]]
             r[k] = off[k] / ca.sqrt(covariance[2, 2])
-        return r, off
-    [gap], [covariance] = gaps, covariances
-    if loop.kind == "fixed_point":
-        gap -= x[layout.point[loop.unknown]]
-    elif loop.kind == "recorded":
-        gap -= recorded
-    return ca.solve(ca.chol(covariance).T, gap), gap
+            continue
+        if closure.kind == "fixed_point":
+            gap -= x[layout.unknown[closure]]
+        elif closure.kind == "recorded":
+            gap -= recorded
+        off, r = gap, ca.solve(ca.chol(covariance).T, gap)
+    return r, off
+
+
+# Prior ----------------------------------------------------------------------------------------------------------------
+
+
+def build_prior(
+    layout: Layout, prior: Subject, measured: Mapping[str, tuple[float, float]], sensors: Mapping[str, Gaussian]
+) -> Gaussian:
+    """Return all that is known before the motion, as one Gaussian over x.
+
+    Parameters
+    ----------
+    prior : lengths and girdles
+    measured : name of a length → value and standard deviation [m]
+    sensors : segment → what is known of its sensor's (ε_x, ε_y, ψ)
+
+    It raises `BadSubject` where the prior has no positive definite covariance of its lengths.
+    """
+    table, information, mean = layout.model.table, np.zeros((layout.size, layout.size)), np.zeros(layout.size)
+    shape = np.concatenate((layout.length, layout.girdle.ravel()))
+    mean[shape], information[np.ix_(shape, shape)] = _build_shape_prior(layout, prior, measured)
+    for name, tilt, heading in zip(layout.sensors, layout.tilt, layout.heading, strict=True):
+        rows = [*tilt, heading]
+        mean[rows], information[np.ix_(rows, rows)] = sensors[name]
+    information[layout.drift, layout.drift] = DRIFT_STD**-2
+    for name, foam in zip(layout.soft, layout.foam, strict=True):
+        information[foam, foam] = np.maximum(np.tile(table.segments[name].foam_std, 3), LEAST_FOAM_STD) ** -2.0
+    for hinge, twist in zip(layout.twists, layout.twist, strict=True):
+        information[twist, twist] = table.segments[hinge.on].soft_tissue.per_twist ** -2.0
+    # Axes of hinges; those of a left and a right one are partly alike.
+    hinges = {hinge.name: rows for hinge, rows in zip(layout.hinges, layout.hinge, strict=True)}
+    for name, (across, tilted) in hinges.items():
+        own, other = table.hinges[name], table.counterpart(name)
+        information[tilted, tilted] = own.tilt_std**-2
+        if other not in hinges:
+            information[across, across] = 1.0 / (own.common_std**2 + own.mirror_std**2)
+        elif table.side(name) == "left":
+            pair = np.ix_((across, hinges[other][0]), (across, hinges[other][0]))
+            information[pair] = 0.25 * own.common_std**-2 + 0.25 * own.mirror_std**-2 * np.array([[1, -1], [-1, 1]])
+    for closure, places in layout.unknown.items():
+        information[places, places] = (POINT_STD if closure.at is None else closure.at_std) ** -2
+        mean[places] = closure.at or 0.0
+    return mean, information
+
+
+def _build_shape_prior(layout: Layout, prior: Subject, measured: Mapping[str, tuple[float, float]]) -> Gaussian:
+    """Return lengths and girdles jointly: of the prior, else of the table, with measured lengths."""
+    table, size, count = layout.model.table, len(PARAMETERS), len(layout.lengths)
+    own = [prior.girdles.get(name, np.zeros(size)) for name in layout.girdles]
+    begins = [count + size * list(table.girdles).index(name) for name in layout.girdles]
+    rows = np.concatenate([np.arange(count), *(begin + np.arange(size) for begin in begins)])
+    covariance = prior.shape_covariance(table)[np.ix_(rows, rows)]
+    covariance[count:, count:] += LEAST_GIRDLE_STD**2 * np.eye(len(covariance) - count)
+    if not set(layout.lengths) <= set(prior.order) or np.any(np.linalg.eigvalsh(covariance) <= 0.0):
+        raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
+    K = np.linalg.inv(covariance)
+    target = K @ np.concatenate(([prior.lengths[name] for name in layout.lengths], *own))
+    for name, (metres, std) in measured.items():
+        i = layout.lengths.index(name)
+        K[i, i] += std**-2
+        target[i] += metres * std**-2
+    return np.linalg.solve(K, target), K

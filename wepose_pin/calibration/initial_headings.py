@@ -1,4 +1,4 @@
-"""Headings without an initial guess: all at which what is observed has a minimum.
+"""Headings without an initial guess: those that explain best what is observed.
 
 In a closure, a sensor's part u of the way between the points is Rz(ψ) Q(t) Rz(−ψ) u, linear in
 
@@ -18,9 +18,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.lengths import UNIVERSE
-from .conditions import Level, Loop, Pointing
 from .couplings import Coupling
 from .least_squares import Observations
+from .protocols import Axis, Closure, Direction, FreeMotion
 
 STARTS, NEARER = 256, 64  # starts, and how many of the best continue after some rounds
 FIRST_ROUNDS, MORE_ROUNDS = 6, 16
@@ -28,15 +28,13 @@ SEARCH_SAMPLES, LEAST_SEARCH_SAMPLES = 48, 8  # of all closures together, of eac
 GAP_STD = 0.03  # [m] of a closure; includes errors of the lengths and all that the search leaves out
 KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount
 OUTLIER = 5.0  # standard deviations of a sample, at which it has a quarter of its weight
-DISTINCT = np.deg2rad(15.0)  # [rad] of one heading, by which two minima differ
-MOST_DISTINCT = 12
 _FIFTHS = 2.0 * np.pi / 5.0 * np.arange(5)
 
 
 def search_headings(
     observations: Observations, x: np.ndarray, stated: Mapping[str, float], couplings: Sequence[Coupling] = ()
 ) -> np.ndarray:
-    """Return distinct headings ψ (k, sensors) [rad] with a minimum each, the lowest first.
+    """Return the headings ψ (sensors,) [rad] of the lowest minimum.
 
     Lengths, points and heights are those of x (m,); `stated` has the ψ of sensors with a stated mount, others may be
     anywhere.
@@ -49,13 +47,9 @@ def search_headings(
     order = np.random.default_rng(0).permuted(np.tile(np.arange(STARTS), (len(sensors), 1)), axis=1).T
     psi, information = np.where(is_known, center, 2.0 * np.pi / STARTS * order), is_known / KNOWN_STD**2
     psi = _descend(psi, constant, F, center, information, FIRST_ROUNDS)[:NEARER]
-    distinct: list[np.ndarray] = []
-    for each in _descend(psi, constant, F, center, information, MORE_ROUNDS):
-        if all(np.abs(wrap_angle(each - other)).max() > DISTINCT for other in distinct):
-            distinct.append(each)
-    headings = wrap_angle(np.array(distinct[:MOST_DISTINCT]))
-    if not stated and not any(isinstance(c, Loop | Pointing | Level) for c in observations.conditions):
-        headings = headings[:1] + _turn_by_hinges(observations, headings[0])
+    headings = wrap_angle(_descend(psi, constant, F, center, information, MORE_ROUNDS)[0])
+    if not stated and all(isinstance(condition, FreeMotion) for condition in observations.layout.conditions):
+        return headings + _turn_by_hinges(observations, headings)
     return headings
 
 
@@ -82,37 +76,36 @@ def _collect_terms(
         constants.append(constant / std)
         harmonics.append(F / std)
 
-    loops = sum(isinstance(condition, Loop) for condition in observations.conditions)
-    count = max(SEARCH_SAMPLES // max(loops, 1), LEAST_SEARCH_SAMPLES)
-    for condition, span in observations.spans():
+    count = max(SEARCH_SAMPLES // max(len(observations.closures), 1), LEAST_SEARCH_SAMPLES)
+    for condition, span in observations.spans:
         some = np.arange(len(observations))[span]
-        if isinstance(condition, Loop):
+        if isinstance(condition, Closure):
             some = np.unique(np.linspace(span.start, span.stop - 1, count).astype(int))
         Q = {name: Rotation.from_quat(observations.data[4 * i : 4 * i + 4, some].T) for i, name in enumerate(sensors)}
-        if isinstance(condition, Loop):
+        if isinstance(condition, Closure):
             axes = np.array([condition.kind != "plane", condition.kind != "plane", True])
-            for path in condition.paths:
+            for path in layout.paths[condition]:
                 constant, parts = np.zeros((len(some), 3)), {}
-                for part in path.vectors:
-                    vector = part.vector(x[layout.length])
-                    if part.segment == UNIVERSE:
+                for segment, (B, c) in path.vectors.items():
+                    vector = B @ x[layout.length] + c
+                    if segment == UNIVERSE:
                         constant = constant + axes * vector
                     else:
-                        parts[part.segment] = axes * _expand(Q[part.segment], vector)
+                        parts[segment] = axes * _expand(Q[segment], vector)
                 if condition.kind == "recorded":
                     constant = constant - observations.data[layout.place][:, some].T
-                elif condition.closure.at is not None:
-                    constant = constant - condition.closure.at
+                elif condition.at is not None:
+                    constant = constant - condition.at
                 elif condition.kind in ("fixed_point", "plane"):  # of any mean
                     constant = constant - constant.mean(axis=0)
                     parts = {name: F - F.mean(axis=1, keepdims=True) for name, F in parts.items()}
                 add(GAP_STD, constant, parts)
-        elif isinstance(condition, Pointing):
+        elif isinstance(condition, Direction):
             parts = {condition.segment: _expand(Q[condition.segment], condition.along)}
             if condition.reference != condition.segment:
                 parts[condition.reference] = -_expand(Q[condition.reference], condition.direction)
             add(condition.std, np.zeros((1, 3)), {k: F.mean(axis=1, keepdims=True) for k, F in parts.items()})
-        elif isinstance(condition, Level):
+        elif isinstance(condition, Axis):
             turn = Q[condition.segment].as_rotvec().sum(axis=0) * [1.0, 1.0, 0.0]  # forwards: about the axis
             turn = turn / max(float(np.linalg.norm(turn)), 1e-9)
             add(condition.std, -np.array([condition.axis]), {condition.segment: _turn_about_z(turn)})

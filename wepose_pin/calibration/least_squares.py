@@ -6,7 +6,8 @@ lines of NumPy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,8 +15,8 @@ import casadi as ca
 import numpy as np
 
 from ..errors import NoSolution
-from .conditions import Constraint, Level, Loop, Pointing
-from .equations import Layout, sample_functions
+from .equations import Gaussian, Layout
+from .protocols import Axis, Closure, Condition, Direction
 
 MIN_LENGTH = 0.01  # [m] below which a length has not converged
 STEPS = 60
@@ -26,8 +27,6 @@ _QUIET_QP = _QUIET | dict.fromkeys(("print_iter", "print_info"), False)
 _QUIET_NLP = _QUIET | dict.fromkeys(("print_iteration", "print_status", "show_eval_warnings"), False)
 _BLAS = "classic" if ca.has_blas("classic") else "reference"
 
-Gaussian = tuple[np.ndarray, np.ndarray]  # a normal distribution of x: mean (m,) and information (m, m)
-
 
 @dataclass(frozen=True)
 class Observations:
@@ -35,62 +34,72 @@ class Observations:
 
     layout: Layout
     data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.place`, [s] since the start pose
-    conditions: tuple[Constraint, ...]
     condition_index: np.ndarray  # (n,) number of each sample's condition, in ascending order
-    phases: tuple[str, ...] = ()  # of the conditions
 
     def __len__(self) -> int:
         return self.data.shape[1]
 
-    def take(self, columns: np.ndarray) -> Observations:
-        """Return some of the samples: ascending numbers, or bool (n,)."""
-        return replace(self, data=self.data[:, columns], condition_index=self.condition_index[columns])
+    @cached_property
+    def spans(self) -> list[tuple[Condition, slice]]:
+        """Each condition with the slice of its samples."""
+        edges = np.searchsorted(self.condition_index, np.arange(len(self.layout.conditions) + 1))
+        return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.layout.conditions)]
 
-    def spans(self) -> list[tuple[Constraint, slice]]:
-        """Return each condition with the slice of its samples."""
-        edges = np.searchsorted(self.condition_index, np.arange(len(self.conditions) + 1))
-        return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.conditions)]
+    @cached_property
+    def closures(self) -> list[tuple[Closure, slice]]:
+        """Each closure with the slice of its samples."""
+        return [(condition, span) for condition, span in self.spans if isinstance(condition, Closure)]
 
-    def poses(self) -> dict[str, list[tuple[Pointing | Level, slice]]]:
-        """Return phase → its stated poses, each with the slice of its samples."""
-        poses: dict[str, list[tuple[Pointing | Level, slice]]] = {}
-        for phase, (condition, span) in zip(self.phases, self.spans(), strict=False):
-            if isinstance(condition, Pointing | Level):
-                poses.setdefault(phase, []).append((condition, span))
+    @cached_property
+    def poses(self) -> dict[str, list[tuple[Direction | Axis, slice]]]:
+        """Phase → its stated poses, each with the slice of its samples."""
+        poses: dict[str, list[tuple[Direction | Axis, slice]]] = {}
+        for condition, span in self.spans:
+            if isinstance(condition, Direction | Axis):
+                poses.setdefault(condition.phase, []).append((condition, span))
         return poses
 
-    @property
-    def closed(self) -> np.ndarray:
-        """(n,) bool: samples of a closure."""
-        return np.array([isinstance(c, Loop) for c in self.conditions], dtype=bool)[self.condition_index]
+    @cached_property
+    def _functions(self) -> list[tuple[tuple[ca.Function, ca.Function], ca.DM]]:
+        """The functions of each condition with its data, which CasADi maps them over."""
+        return [(self.layout.functions[condition], ca.DM(self.data[:, span])) for condition, span in self.spans]
 
     def residuals(self, x: ca.MX | np.ndarray) -> tuple[ca.MX, ca.MX]:
         """Return the residuals (k, n) and the gaps (3, n) [m], zero without a closure, in CasADi."""
-        r, gaps = zip(*(functions[0](x, data) for functions, data in self._functions()), strict=True)
+        r, gaps = zip(*(functions[0](x, data) for functions, data in self._functions), strict=True)
         return ca.horzcat(*r), ca.horzcat(*gaps)
 
     def jacobian(self, x: ca.MX | np.ndarray) -> ca.MX:
         """Return the transposed Jacobian of all residuals (m, n k), sample by sample, in CasADi."""
-        return ca.horzcat(*(functions[1](x, data) for functions, data in self._functions()))
-
-    def _functions(self) -> list[tuple[tuple[ca.Function, ca.Function], ca.DM]]:
-        """Return the functions of each condition that has samples, with their data, which CasADi maps them over."""
-        spans = [(condition, span) for condition, span in self.spans() if span.start < span.stop]
-        return [(sample_functions(self.layout, condition), ca.DM(self.data[:, span])) for condition, span in spans]
+        return ca.horzcat(*(functions[1](x, data) for functions, data in self._functions))
 
     def gaps(self, x: np.ndarray) -> np.ndarray:
         """Return the gaps (n, 3) [m] at x (m,), zero without a closure."""
         return np.asarray(self.residuals(x)[1]).T
 
+    def place_points(self, x: np.ndarray) -> np.ndarray:
+        """Return x with each unknown fixed point and height at the mean of the body's points that lie on it."""
+        unknown = self.layout.unknown
+        x, gaps = x.copy(), self.gaps(x) if unknown else np.zeros((len(self), 3))
+        for closure, span in self.closures:
+            if closure.kind == "plane":
+                x[unknown[closure]] += gaps[span, : closure.rows].mean()
+            elif closure.kind == "fixed_point" and closure.at is None:
+                x[unknown[closure]] += gaps[span].mean(axis=0)
+        return x
+
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c) at one x, to be made least."""
+    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c) at one x, to be made least; and how the weights were found (`weights`)."""
 
     observations: Observations  # n samples, each with k residuals r
     prior: Gaussian  # c and Λ
     weights: np.ndarray  # w (n, k)
     x: np.ndarray  # (m,)
+    contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
+    effective_sample_size: float = 0.0  # of the gap
+    posed: Mapping[str, float] = field(default_factory=dict)  # phase of poses → standard deviations off all else
 
     @property
     def lower_bounds(self) -> np.ndarray:
@@ -129,12 +138,6 @@ class LeastSquares:
     def covariance(self) -> np.ndarray:
         """(m, m) the inverse of the information."""
         return np.linalg.inv(self.information)
-
-    @property
-    def cost(self) -> float:
-        """Twice what is made least."""
-        off = self.x - self.prior[0]
-        return float(np.sum(self.weights * self.residuals**2) + off @ self.prior[1] @ off)
 
     @property
     def gradient(self) -> np.ndarray:

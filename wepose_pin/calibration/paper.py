@@ -32,7 +32,6 @@ from ..body.girdle import FIXED
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
-from .conditions import Loop
 from .least_squares import MIN_LENGTH
 from .problem import CalibrationProblem
 from .protocols import Closure
@@ -65,9 +64,10 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     }
     names = tuple(problem.model.lengths)
     A = np.zeros((len(samples), 3, len(names)))
-    for loop, span in observations.spans():
-        for part in loop.parts if isinstance(loop, Loop) else ():
-            A[span] += Rotation.from_quat(quat_WL[part.segment][span]).as_matrix() @ np.array(part.by_length)
+    for closure, span in observations.closures:
+        [path] = problem.layout.paths[closure]
+        for segment, (B, _) in path.vectors.items():
+            A[span] += Rotation.from_quat(quat_WL[segment][span]).as_matrix() @ B
     E, d, d_cov = _state_constraints(problem)
     # ℓ = E⁺ d + Z z, where Z spans what E leaves free
     rows, Z, pinv = A.reshape(-1, len(names)), null_space(E), np.linalg.pinv(E)
@@ -125,7 +125,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "
             f"such as clasp; not '{protocol.name}'"
         )
-    groups = problem.length_groups.values()
+    groups = problem.layout.length_groups.values()
     if not any(set(group) <= set(problem.measured) for group in groups):
         names = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
@@ -136,7 +136,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
 
 def _state_constraints(problem: CalibrationProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return E (m, k), d (m,) and its covariance (m, m): measured lengths, and what only the population tells."""
-    groups = problem.length_groups.values()
+    groups = problem.layout.length_groups.values()
     names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
     unit, assumed = dict(zip(names, np.eye(len(names)), strict=True)), list[np.ndarray]()
     for group in groups:  # proportions

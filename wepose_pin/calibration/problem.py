@@ -13,31 +13,22 @@ from scipy.spatial.transform import Rotation
 from ..body import BodyModel
 from ..body.mounts import (
     MAX_MOUNT_ERROR_DEG,
+    MEASURED_ORIENTATION_STD,
     MOUNT_WARNING_DEG,
-    StartPose,
     compute_heading_offset,
+    find_mount_covariance,
     find_nominal_mount,
-    find_start_pose,
 )
 from ..body.subject import Subject
+from ..body.table import NEUTRAL_POSE
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase
 from ..filters.sensors import FilteredRecording
-from ..observations.expressions import ZERO_LENGTH, find_girdles, find_hinges
 from ..observations.joint_accelerations import find_neighbours
 from ..recording import Intervals, Recording, format_span
-from .conditions import (
-    Constraint,
-    Loop,
-    Pointing,
-    find_connected,
-    find_samples,
-    mask_measured,
-    read_recorded_places,
-    resolve_conditions,
-)
+from .conditions import find_connected, find_samples, mask_measured, read_recorded_places
 from .couplings import Coupling, estimate_couplings
-from .equations import Layout, find_twists
+from .equations import Gaussian, Layout
 from .least_squares import Observations
 from .protocols import Closure, Condition, FreeMotion, Protocol
 
@@ -46,8 +37,9 @@ SAMPLE_RATE_HZ = 8.0
 MOST_SAMPLES = 2000  # of all conditions; longer ones are sampled at a lower rate
 LEAST_S = 1.25  # [s] of each condition, in which all sensors measure
 FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
-USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of the arms off hanging, hands joined before the chest
-RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
+# Standard deviations [rad] of a stated mount's heading, as mounts name sensor axes that are estimated by eye, and of an
+# unknown heading: the whole circle.
+STATED_STD, HEADING_STD = np.deg2rad(10.0), np.pi / np.sqrt(3.0)
 
 
 @dataclass(frozen=True)
@@ -56,77 +48,46 @@ class CalibrationProblem:
 
     recording: Recording  # the samples
     filtered: FilteredRecording  # the orientations of its sensors, each in its own world
-    protocol: Protocol  # what the person did in which phase
+    layout: Layout  # the unknowns of what the person did in which phase
     prior: Subject  # lengths with their covariance, and mounts
     measured: Mapping[str, tuple[float, float]]  # name of a length → value and standard deviation [m]
-    model: BodyModel  # the body
     # diagnostics of mounts that are not used, as gravity or the motion contradicts them
     unused_mounts: tuple[Diagnostic, ...] = ()
 
-    @cached_property
-    def start_pose(self) -> StartPose:
-        """The links of the body in the start pose."""
-        return find_start_pose(self.model, self.recording)
+    @property
+    def protocol(self) -> Protocol:
+        """What the person did in which phase."""
+        return self.layout.protocol
 
-    @cached_property
-    def conditions(self) -> tuple[Constraint, ...]:
-        """The protocol's conditions on the body with these sensors, in the protocol's order.
-
-        It raises `BadSession` for a closure between points that no sensor determines, or a pose without its sensor.
-        """
-        return resolve_conditions(self.protocol, self.model, self.start_pose, self.recording)
-
-    @cached_property
-    def length_groups(self) -> dict[str, tuple[str, ...]]:
-        """Sensor → the lengths that rotate with it in some closure, which observes sums of those in one direction."""
-        groups: dict[str, dict[str, None]] = {}
-        for part in [part for loop in self.conditions if isinstance(loop, Loop) for part in loop.parts]:
-            moved = np.abs(np.array(part.by_length)).max(axis=0) > ZERO_LENGTH
-            names = [name for name, moves in zip(self.model.lengths, moved, strict=True) if moves]
-            groups.setdefault(part.segment, {}).update(dict.fromkeys(names))
-        return {sensor: tuple(names) for sensor, names in groups.items() if names}
-
-    @cached_property
-    def lengths_in_closures(self) -> tuple[str, ...]:
-        """The names of the lengths that some closure contains."""
-        inside = {name for group in self.length_groups.values() for name in group}
-        return tuple(name for name in self.model.lengths if name in inside)
+    @property
+    def model(self) -> BodyModel:
+        """The body."""
+        return self.layout.model
 
     @property
     def scale_lengths(self) -> tuple[str, ...]:
         """The measured lengths that fix the scale; empty: the prior does."""
         # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
-        return tuple(name for name in self.measured if name in (self.lengths_in_closures or self.model.lengths))
+        return tuple(name for name in self.measured if name in (self.layout.lengths_in_closures or self.model.lengths))
 
     @property
     def measured_example(self) -> str:
         """The measurement that would fix the scale best, as ``name=metres``: the protocol's, then the longest length in
         a closure that was not measured.
         """
-        names = [name for name in self.lengths_in_closures if name not in self.measured]
+        names = [name for name in self.layout.lengths_in_closures if name not in self.measured]
         if not names or (self.protocol.measured_example and not self.measured):
             return self.protocol.measured_example
         return f"{max(names, key=self.model.lengths.__getitem__)}=METRES"
-
-    @cached_property
-    def sensors(self) -> tuple[str, ...]:
-        """The segments with sensors that some condition uses, in the order of the table."""
-        used = set[str]()
-        for condition in self.conditions:
-            if isinstance(condition, Loop):
-                used |= {part.segment for part in condition.parts}
-            elif isinstance(condition, FreeMotion):
-                used |= set(self.filtered.R_VS)
-            else:
-                used |= {condition.segment, condition.reference if isinstance(condition, Pointing) else ""}
-        return tuple(name for name in self.model.table.segments if name in used)
 
     @cached_property
     def couplings(self) -> list[Coupling]:
         """The relative headings of neighbours by the acceleration of the joint between them."""
         moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
         spans = [span for condition in moving for span in self.intervals(condition)]
-        return estimate_couplings(self.recording, self.filtered, find_neighbours(self.model, self.sensors), spans)
+        return estimate_couplings(
+            self.recording, self.filtered, find_neighbours(self.model, self.layout.sensors), spans
+        )
 
     def intervals(self, condition: Condition) -> Intervals:
         """Return the intervals [s] in which a condition holds; raise `BadPhase` where the recording lacks its phase."""
@@ -139,14 +100,45 @@ class CalibrationProblem:
 
     def mount(self, segment: str) -> Rotation | None:
         """Return the mount of prior or session, with an L that equals W in the start pose; None: unknown."""
-        mount = find_nominal_mount(self.recording, segment, self.prior, self.start_pose)
-        return None if mount is None else self.start_pose.to_world(segment, Rotation.from_quat(mount))
+        start_pose = self.layout.start_pose
+        mount = find_nominal_mount(self.recording, segment, self.prior, start_pose)
+        return None if mount is None else start_pose.to_world(segment, Rotation.from_quat(mount))
 
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
         """Return segment → ψ [rad] by its mount, of those of these segments whose mount is known."""
         mounts = {segment: self.mount(segment) for segment in segments}
         R_VS_start = self.filtered.R_VS_start
         return {k: compute_heading_offset(R_VS_start[k], mount) for k, mount in mounts.items() if mount is not None}
+
+    def sensor_prior(self, segment: str) -> Gaussian:
+        """Return what start pose and mount tell of a sensor's (ε_x, ε_y, ψ): mean (3,) and information (3, 3).
+
+        The person stands nearly in the start pose. A mount R_LS = exp(m) R_0 has a small error m = μ − ε + ψ e_z, with
+        μ the misfit of the start pose at the heading nearest to R_0. An unknown heading is 0.
+        """
+        recording, own, mount = self.recording, self.model.table.segments[segment], self.mount(segment)
+        R_start = self.layout.start_pose.rotation(segment)
+        start_cov = R_start @ np.diag(np.square(own.start_std)) @ R_start.T
+        mean, information = np.zeros(3), np.zeros((3, 3))
+        information[:2, :2], information[2, 2] = np.linalg.inv(start_cov[:2, :2]), HEADING_STD**-2
+        if recording.start_pose == NEUTRAL_POSE:
+            mean[:2] = own.start_mean[:2]
+        if mount is None:
+            return mean, information
+        R_VS_start = self.filtered.R_VS_start[segment]
+        heading = [0.0, 0.0, compute_heading_offset(R_VS_start, mount)]
+        covariance = find_mount_covariance(recording, segment, self.prior)
+        if covariance is not None:
+            of_mount = np.linalg.inv(R_start @ covariance @ R_start.T + 1e-12 * np.eye(3))
+        elif segment in recording.imus and (recording.remounted or segment not in self.prior.mounts):
+            of_mount = np.diag([0.0, 0.0, STATED_STD**-2])
+        else:
+            of_mount = np.eye(3) / MEASURED_ORIENTATION_STD**2
+        misfit = (Rotation.from_rotvec(heading) * R_VS_start * mount.inv()).as_rotvec()
+        signs = np.diag([-1.0, -1.0, 1.0])
+        both = information + signs @ of_mount @ signs
+        target = information @ mean - signs @ of_mount @ np.append(misfit[:2], 0.0)
+        return np.linalg.solve(both + 1e-9 * np.eye(3), target) + heading, both
 
     def remove_mounts(self, segments: Collection[str]) -> CalibrationProblem:
         """Return the same problem without the mounts of these segments."""
@@ -167,7 +159,7 @@ class CalibrationProblem:
                 up_V = (self.filtered.R_VS_start[name] * mount.inv()).apply([0.0, 0.0, 1.0])
                 angle = float(np.arccos(np.clip(up_V[2], -1.0, 1.0)))
             else:
-                R_estimated = self.start_pose.to_world(name, Rotation.from_quat(estimated[name]))
+                R_estimated = self.layout.start_pose.to_world(name, Rotation.from_quat(estimated[name]))
                 angle = float((R_estimated * mount.inv()).magnitude())
             if angle > limit:
                 unused.append(Diagnostic("mount-contradicted", WARNING, name, angle, limit, {"variant": "unused"}))
@@ -188,7 +180,7 @@ class CalibrationProblem:
         """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""
         filtered, quat_WL = self.filtered, {}
         for name in (name for name in filtered.R_VS if name in mounts):
-            R_WS_start = self.start_pose.to_world(name, Rotation.from_quat(mounts[name]))
+            R_WS_start = self.layout.start_pose.to_world(name, Rotation.from_quat(mounts[name]))
             R_WV = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_WS_start)])
             R_WL = R_WV * filtered.R_VS[name][samples] * R_WS_start.inv() * self.start_rotation(name)
             quat_WL[name] = R_WL.as_quat()
@@ -196,7 +188,7 @@ class CalibrationProblem:
 
     def start_rotation(self, segment: str) -> Rotation:
         """Return R_WL of a segment in the start pose; L is the segment's frame."""
-        return Rotation.from_matrix(self.start_pose.rotation(segment))
+        return Rotation.from_matrix(self.layout.start_pose.rotation(segment))
 
     # Samples ----------------------------------------------------------------------------------------------------------
 
@@ -208,7 +200,7 @@ class CalibrationProblem:
     @cached_property
     def connected(self) -> tuple[np.ndarray, str, tuple[float, float]]:
         """The samples at which no sensor has lost its heading since the start pose, as `find_connected`."""
-        return find_connected(self.recording, self.filtered.start, self.sensors)
+        return find_connected(self.recording, self.filtered.start, self.layout.sensors)
 
     def diagnose_losses(self) -> list[Diagnostic]:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
@@ -225,16 +217,16 @@ class CalibrationProblem:
 
         It raises `BadPhase` where a condition has too few samples with all sensors, connected with the start pose.
         """
-        recording, filtered, layout = self.recording, self.filtered, self._lay_out()
-        (connected, lost, loss), conditions = self.connected, self.protocol.conditions
+        recording, filtered, layout = self.recording, self.filtered, self.layout
+        (connected, lost, loss), conditions = self.connected, layout.conditions
         stride = max(1, round(recording.rate_hz / rate_hz), sum(map(len, self.phase_samples)) // MOST_SAMPLES)
         parts, places = [], []
-        for condition, constraint, phase in zip(conditions, self.conditions, self.phase_samples, strict=True):
+        for condition, phase in zip(conditions, self.phase_samples, strict=True):
             samples = phase[::stride]
             samples = samples[mask_measured(recording, recording.sensors, samples) & connected[samples]]
             place = np.zeros((len(samples), 3))
-            if isinstance(constraint, Loop) and constraint.kind == "recorded":
-                place = read_recorded_places(recording, constraint.closure, recording.time[samples])
+            if isinstance(condition, Closure) and condition.kind == "recorded":
+                place = read_recorded_places(recording, condition, recording.time[samples])
                 known = np.isfinite(place).all(axis=1)
                 samples, place = samples[known], place[known]
             parts.append(samples)
@@ -255,33 +247,10 @@ class CalibrationProblem:
         rotations_since_start = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
-        recorded = np.concatenate(places).T[: 3 * layout.recorded]
+        recorded = np.concatenate(places).T[: layout.place.stop - layout.place.start]
         data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        names = tuple(condition.phase for condition in conditions)
-        return Observations(layout, data, self.conditions, condition_index, names), samples
-
-    def _lay_out(self) -> Layout:
-        segments, start, sensors = self.model.table.segments, self.start_pose, self.sensors
-        hinges, kinds = find_hinges(self.model, start, sensors), [each.kind for each in self.protocol.closures]
-        attitude_std = []
-        for name in sensors:  # of a sensor's orientation about an axis across its segment, arms raised
-            tissue = segments[name].soft_tissue
-            growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
-            std = float(np.sqrt(np.mean(np.square(tissue.std) + growth**2)))
-            attitude_std.append(std or RIGID_ATTITUDE_STD)
-        return Layout(
-            tuple(self.model.lengths),
-            sensors,
-            hinges,
-            find_girdles(self.model, start, sensors),
-            find_twists(self.model.table, hinges, sensors),
-            fixed=kinds.count("fixed_point"),
-            planes=kinds.count("plane"),
-            recorded="recorded" in kinds,
-            soft=tuple(name for name in sensors if any(segments[name].foam_std)),
-            attitude_std=tuple(attitude_std),
-        )
+        return Observations(layout, data, condition_index), samples
 
 
 def _name_phase(condition: Condition) -> str:

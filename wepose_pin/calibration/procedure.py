@@ -43,6 +43,7 @@ from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..recording import Recording
+from .equations import Layout
 from .paper import Formulation, solve_paper_calibration
 from .problem import CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
@@ -146,7 +147,8 @@ def calibrate(
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:  # the two calibrations are fused, each on the population prior
         prior = separate_mounts(earlier, population_subject(body=model))
-    problem = CalibrationProblem(recording, filtered, protocol, prior, lengths, model)
+    layout = Layout(protocol, model, recording)
+    problem = CalibrationProblem(recording, filtered, layout, prior, lengths)
     calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
     if earlier is not None:
         fused = fuse_calibrations(earlier, calibration.subject, model.table)
@@ -213,7 +215,7 @@ def exchange_labels(stated: Calibration) -> Calibration:
     rotations = [*measure_rotations(stated).values()]
     if doubt <= 1.0 or table.is_mechanism or not rotations or np.median(rotations) < LEAST_ROTATION:
         return stated
-    places = [name for name in problem.sensors if name in table.needed]
+    places = [name for name in problem.layout.sensors if name in table.needed]
     sides = [(a, b) for a, b in table.pairs.items() if {a, b} <= set(places)]
     exchanges = [dict((pair, pair[::-1])) for pair in combinations(places, 2)]
     exchanges.append({a: b for pair in sides for a, b in (pair, pair[::-1])})

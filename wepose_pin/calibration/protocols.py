@@ -27,7 +27,7 @@ import numpy as np
 
 from ..body import BodyTable, list_breadths
 from ..body.mounts import PALM_SLIP_STD
-from ..body.table import check_segments
+from ..body.table import Vector, check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
 from ..libraries import asset
@@ -74,20 +74,26 @@ class Closure(NamedTuple):
 
 
 class Direction(NamedTuple):
-    """A segment's long axis points along `direction` (3,) of the body's first segment, to within `std` [rad]."""
+    """A segment's long axis points along a direction of another, to within `std` [rad]; unit vectors (3,).
+
+    Vectors are in the segments' frames L; of a body's conditions in L'.
+    """
 
     phase: str
     segment: str
-    direction: tuple[float, float, float]
+    direction: Vector
     std: float
+    reference: str = ""  # segment of `direction`; that of the body which faces x
+    along: Vector = (0.0, 0.0, -1.0)  # the long axis
 
 
 class Axis(NamedTuple):
-    """The segment bends forwards about a level axis that is within `std` [rad] of its own y."""
+    """The segment bends forwards about `axis` (3,), which is level in the start pose, to within `std` [rad]."""
 
     phase: str
     segment: str
     std: PoseStd
+    axis: Annotated[Vector, None] = (0.0, 1.0, 0.0)  # in L; of a body's conditions in L'
 
 
 class FreeMotion(NamedTuple):

@@ -18,7 +18,6 @@ from ..body.subject import Quality
 from ..body.table import ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences
 from ..recording import format_span
-from .conditions import is_scale_observed
 from .result import MIN_CONTACT, Calibration, CalibrationQuality, Check, QualityLimits
 from .weights import CONTRADICTED
 
@@ -125,13 +124,13 @@ def _check(
 def _check_lengths(calibration: Calibration, rotations: Mapping[str, float]) -> list[Check]:
     """Checks of the lengths that rotate together in a closure, and of the scale where no closure shows it."""
     problem, subject, checks = calibration.problem, calibration.subject, list[Check]()
-    table, scale_observed = problem.model.table, is_scale_observed(problem.conditions)
+    table, scale_observed = problem.model.table, problem.layout.scale_observed
     # Lengths that begin at the root cancel in a closed chain, and are one with a point of W that is not known.
     names = [name for name, length in table.lengths.items() if ROOT not in length.start]
     lengths, shape = np.array([subject.lengths[name] for name in names]), subject.lengths_covariance(names)
     if len(names) > 1 and not scale_observed:  # errors of the scale change all lengths together
         shape = shape - np.outer(lengths, lengths) / float(lengths @ np.linalg.solve(shape, lengths))
-    for sensor, group in problem.length_groups.items():
+    for sensor, group in problem.layout.length_groups.items():
         if summed := [name for name in group if name in names]:
             take = np.isin(names, summed).astype(float)
             std = float(np.sqrt(max(take @ shape @ take, 0.0)))
@@ -192,7 +191,7 @@ def _find_cause(calibration: Calibration, rotations: Mapping[str, float], spine:
     if not rotations:
         return None
     table = calibration.problem.model.table
-    limbs = [name for name in calibration.problem.length_groups if not table.segments[name].spine]
+    limbs = [name for name in calibration.problem.layout.length_groups if not table.segments[name].spine]
     variant, enough = ("spine", ENOUGH_SPINE) if spine else ("limbs", ENOUGH_LIMBS)
     own = [rotations[name] for name in ([table.reference] if spine else limbs) if name in rotations]
     if own and min(own) < enough and not table.is_mechanism:

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from .conditions import Level, Loop, Pointing
 from .couplings import LEAST_CORRELATION_S
-from .equations import GAP_ROWS, HINGE_STD
-from .least_squares import STEPS, Gaussian, LeastSquares, Observations, solve
-from .protocols import FreeMotion
+from .equations import GAP_ROWS, HINGE_STD, Gaussian
+from .least_squares import STEPS, LeastSquares, Observations, solve
+from .protocols import Axis, Closure, Direction, FreeMotion
 from .result import MIN_CONTACT, MeasuredLength
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
@@ -43,18 +41,9 @@ LEAST_LENGTH_STD = 0.010
 Block = tuple[slice, slice, np.ndarray, float]
 
 
-class WeightedFit(NamedTuple):
-    """A solution with the weights that its own residuals give."""
-
-    fit: LeastSquares
-    contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
-    effective_sample_size: float  # of the gap
-    posed: Mapping[str, float]  # phase of poses → standard deviations from what is known without it
-
-
 def solve_reweighted(
     observations: Observations, prior: Gaussian, start: np.ndarray, contact: np.ndarray, quick: bool = False
-) -> WeightedFit:
+) -> LeastSquares:
     """Return the fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
 
     Poses beside a closure are used where they do not contradict it. What they are compared with is found without them.
@@ -62,25 +51,25 @@ def solve_reweighted(
     few steps and without hinges.
     """
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
-    contact, correlation = contact.copy(), min_correlation(observations)
-    stated, poses, posed = _state_weights(observations, contact, correlation), observations.poses(), dict[str, float]()
+    correlation, closures, poses = min_correlation(observations), observations.closures, observations.poses
+    stated, posed = _state_weights(observations, contact, correlation), dict[str, float]()
     if quick:
         stated[:, GAP_ROWS:] = 0.0
-    weights, closed = stated.copy(), bool(observations.closed.any())
-    for span in [span for own in poses.values() for _, span in own] if closed else ():
+    weights = stated.copy()
+    for span in [span for own in poses.values() for _, span in own] if closures else ():
         weights[span] = 0.0
-    fit = LeastSquares(observations, prior, weights, start)
-    for k in range(rounds if closed else 0):
+    fit = LeastSquares(observations, prior, weights, start, contact)
+    for k in range(rounds if closures else 0):
         fit = solve(fit, steps if k == 0 else ROUND_STEPS, strict=False)
-        weights, least = fit.weights.copy(), MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
-        for loop, span in observations.spans():
-            if isinstance(loop, Loop):
-                # The lower third: the palms may be apart for half of the phase and more.
-                rows = loop.closure.rows
-                size = np.sum(fit.residuals[span, :rows] ** 2, axis=1)
-                usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[rows], LEAST_VARIANCE)
-                weight = (1.0 + size / (usual * OUTLIER**2 * rows)) ** -2
-                contact[span] = np.where(weight > least, weight, 0.0)
+        weights, contact = fit.weights.copy(), fit.contact.copy()
+        least = MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
+        for closure, span in closures:
+            # The lower third: the palms may be apart for half of the phase and more.
+            rows = closure.rows
+            size = np.sum(fit.residuals[span, :rows] ** 2, axis=1)
+            usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[rows], LEAST_VARIANCE)
+            weight = (1.0 + size / (usual * OUTLIER**2 * rows)) ** -2
+            contact[span] = np.where(weight > least, weight, 0.0)
         for block in _list_blocks(observations, contact, hinges=not quick):
             span, columns, touch, _ = block
             variance, correlated = _measure_block(fit, block, correlation)
@@ -89,25 +78,23 @@ def solve_reweighted(
             posed = {phase: _measure_pose(fit, own, stated, used=False) for phase, own in poses.items()}
             for span in [span for phase, own in poses.items() if posed[phase] <= CONTRADICTED for _, span in own]:
                 weights[span] = stated[span]
-        fit = replace(fit, weights=weights)
+        fit = replace(fit, weights=weights, contact=contact)
     fit = solve(fit, steps if quick else FINAL_STEPS, strict=not quick)
-    effective_sample_size = 0.0
-    for block in _list_blocks(observations, contact, hinges=False):
-        effective_sample_size += float(block[2].sum()) / _measure_block(fit, block, correlation)[1]
-    if not closed and not quick:
+    if not closures and not quick:
         posed = {phase: _measure_pose(fit, own, stated, used=True) for phase, own in poses.items()}
-    return WeightedFit(fit, contact, effective_sample_size, posed)
+    blocks = _list_blocks(observations, contact, hinges=False)
+    size = sum((float(block[2].sum()) / _measure_block(fit, block, correlation)[1] for block in blocks), 0.0)
+    return replace(fit, effective_sample_size=size, posed=posed)
 
 
 def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool = True) -> list[Block]:
     blocks: list[Block] = []
-    for condition, span in observations.spans():
-        if isinstance(condition, Loop):
-            blocks.append((span, slice(condition.closure.rows), contact[span], LEAST_VARIANCE))
-            if observations.layout.hinges and hinges:
-                # However well an elbow's axis fits this motion: what it leaves a hinge by follows the pose.
-                every = np.ones(span.stop - span.start)
-                blocks.append((span, slice(GAP_ROWS, None), every, (ELBOW_STD / HINGE_STD) ** 2))
+    for closure, span in observations.closures:
+        blocks.append((span, slice(closure.rows), contact[span], LEAST_VARIANCE))
+        if observations.layout.hinges and hinges:
+            # However well an elbow's axis fits this motion: what it leaves a hinge by follows the pose.
+            every = np.ones(span.stop - span.start)
+            blocks.append((span, slice(GAP_ROWS, None), every, (ELBOW_STD / HINGE_STD) ** 2))
     return [block for block in blocks if block[2].sum() > 0.0]
 
 
@@ -123,14 +110,14 @@ def _state_weights(observations: Observations, contact: np.ndarray, correlation:
     """Return the weights (n, k) of poses, which are stated, and those of closures to begin with."""
     weights = np.full((len(observations), observations.layout.residuals), 1.0 / correlation)
     weights[:, :GAP_ROWS] *= contact[:, None]
-    for condition, span in observations.spans():
+    for condition, span in observations.spans:
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
         size = ELBOW_STD / HINGE_STD if isinstance(condition, FreeMotion) else 1.0
-        if isinstance(condition, Level):  # by the sine of its bend an axis leaves the horizontal if it is off
+        if isinstance(condition, Axis):  # by the sine of its bend an axis leaves the horizontal if it is off
             first = 4 * observations.layout.sensors.index(condition.segment)
             x, y, _, _ = observations.data[first : first + 4, span]
             size = max(float(np.sqrt(np.mean(1.0 - (1.0 - 2.0 * (x**2 + y**2)) ** 2))), LEAST_BEND)
-        if not isinstance(condition, Loop):
+        if not isinstance(condition, Closure):
             weights[span] = size**-2 / (span.stop - span.start)
     return weights
 
@@ -151,7 +138,7 @@ def count_correlated_samples(r: np.ndarray, least: float) -> float:
     return max(float(1.0 + 2.0 * rho[1:crossing].sum() / rho[0]), least)
 
 
-def estimate_covariance(result: WeightedFit) -> np.ndarray:
+def estimate_covariance(fit: LeastSquares) -> np.ndarray:
     """Return the covariance (m, m) of x under errors that are correlated over time.
 
     The weights count as many samples as one as the errors last. That is right where the motion is as slow as the
@@ -159,13 +146,12 @@ def estimate_covariance(result: WeightedFit) -> np.ndarray:
     sample and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
-    fit = result.fit
     observations, weights, J, C = fit.observations, fit.weights, fit.jacobian, fit.covariance
     gradient, least = fit.prior[1].copy(), min_correlation(observations)
-    for condition, span in observations.spans():
-        if not isinstance(condition, Loop):
+    for condition, span in observations.spans:
+        if not isinstance(condition, Closure):
             gradient += np.einsum("nk,nki,nkj->ij", weights[span], J[span], J[span], optimize=True)
-    for block in _list_blocks(observations, result.contact):
+    for block in _list_blocks(observations, fit.contact):
         span, columns, contact, _ = block
         slope, (variance, duration) = J[span, columns], _measure_block(fit, block, least)
         # The fit has reduced the residuals: their variance gets back what it took.
@@ -198,7 +184,7 @@ def compare_measured(
 
 
 def _measure_pose(
-    fit: LeastSquares, poses: Sequence[tuple[Pointing | Level, slice]], stated: np.ndarray, used: bool
+    fit: LeastSquares, poses: Sequence[tuple[Direction | Axis, slice]], stated: np.ndarray, used: bool
 ) -> float:
     """By how many standard deviations a phase of poses deviates from what is known without it.
 
@@ -210,7 +196,7 @@ def _measure_pose(
         whiten = np.sqrt(stated[span, :GAP_ROWS].sum(axis=0))
         r.append(whiten * fit.residuals[span, :GAP_ROWS].mean(axis=0))
         H.append(whiten[:, None] * fit.jacobian[span, :GAP_ROWS].mean(axis=0))
-        degrees += 2 if isinstance(condition, Pointing) else 1
+        degrees += 2 if isinstance(condition, Direction) else 1
     z, slope = np.concatenate(r), np.concatenate(H)
     of_rest = slope @ fit.covariance @ slope.T
     chi2 = float(z @ np.linalg.solve(np.eye(len(z)) + (-of_rest if used else of_rest), z))

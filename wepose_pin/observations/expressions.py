@@ -2,8 +2,7 @@
 
 A point is the sum of the vectors of the links between it and the root (`wepose_pin.body.lengths`). Each link rotates
 with a segment that has a sensor, its own or the one above it with which it is rigid. Where points coincide, as joined
-palms do, the path from one to the other is zero (`PointPair`); its covariance weighs what is left of it. Girdles move
-the points.
+palms do, the path from one to the other is zero; its covariance weighs what is left of it. Girdles move the points.
 
 The long axis of the segment below a hinge stays in the plane across the hinge's axis, within a range of angles. With n
 the axis in the frame of the segment O above, and e the long axis of the segment M below, n · R_WOᵀ R_WM e = 0.
@@ -12,13 +11,13 @@ the axis in the frame of the segment O above, and e the long axis of the segment
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from ..body import BodyModel, Girdle
+from ..body import BodyModel
 from ..body.girdle import PARAMETERS, displace
 from ..body.lengths import UNIVERSE
 from ..body.links import find_carrier
@@ -83,68 +82,145 @@ def evaluate(function: ca.Function, *inputs: np.ndarray) -> list[np.ndarray]:
 # Paths ----------------------------------------------------------------------------------------------------------------
 
 
-class SegmentVector(NamedTuple):
-    """What rotates with one segment of a path: the vector ``by_length @ lengths + constant`` [m] in L'."""
-
-    segment: str  # with a sensor; `UNIVERSE`: the vector does not rotate
-    by_length: tuple[tuple[float, ...], ...]  # (3, k), lengths in the order of the table
-    constant: Vector
-
-    def vector(self, lengths: np.ndarray) -> np.ndarray:
-        """Return (3,) [m] for lengths (k,) [m]."""
-        return np.array(self.by_length) @ lengths + np.array(self.constant)
-
-
-class PointPath(NamedTuple):
-    """The path from the root to a point, or from one point to another."""
-
-    vectors: tuple[SegmentVector, ...]  # whose sum is the path, but for girdles
-    girdles: tuple[tuple[str, float], ...]  # those that move the ends, each with the sign of its displacement
-
-
-class GirdleTerm(NamedTuple):
-    """A girdle with sensors on both its segments."""
-
-    name: str
-    law: Girdle
-    along: Vector  # of the limb, in L' of `law.moves`
-    R_on: tuple[float, ...]  # (9,) row by row: maps the frame L of `law.on` to its L'
-    scale: float  # of the law
-
-    def displacement(self, quat_WL: Mapping[str, ca.SX], parameters: ca.SX) -> ca.SX:
-        """Return the displacement (3,) [m] in W of the point that the girdle moves, by a person's parameters (7,)."""
-        R_on, law = ca.DM(np.reshape(self.R_on, (3, 3))), self.law
-        along = R_on.T @ rotate_back(quat_WL[law.on], rotate(quat_WL[law.moves], self.along))
-        by_law, raised = displace(law, ca.vertsplit(along), self.scale, ca)
-        own = (1.0 + parameters[0]) * ca.vertcat(*by_law) + parameters[1:4] + raised * parameters[4:]
-        return rotate(quat_WL[law.on], R_on @ own)
-
-
-def express_path(
-    path: PointPath,
-    quat_WL: Mapping[str, ca.SX],
-    lengths: ca.SX,
-    girdles: Mapping[str, tuple[GirdleTerm, ca.SX]],
-) -> tuple[ca.SX, dict[str, ca.SX]]:
-    """Return a path (3,) [m] in W, and its vectors, segment → (3,) [m], without the girdles.
+class PointPath:
+    """The path from the root to a point, or between two points that coincide at times.
 
     Parameters
     ----------
-    quat_WL : segment → (4,) xyzw of L'
-    lengths : (k,) [m], in the order of the table
-    girdles : name → the girdle and a person's parameters (7,)
+    model, start : the body, with a person's lengths and girdles, and its start pose
+    sensors : k segments with sensors
+    points : each with the sign of its path from the root
+    where : begins the text of errors
+
+    Attributes
+    ----------
+    vectors : segment → (B (3, lengths), c (3,) [m]), the part B l + c of the path that rotates with it, in L'; that of
+        `UNIVERSE` does not rotate. Segments are in the order of the table
+    girdles : those that move the ends, each with the sign of its displacement
+
+    Raises
+    ------
+    BadSession
+        A link on the path has no sensor, and is not rigid with one that has.
     """
-    whole, vectors = ca.SX.zeros(3), {}
-    for name, sign in path.girdles:
-        if name in girdles:
-            term, parameters = girdles[name]
-            whole += sign * term.displacement(quat_WL, parameters)
-    for part in path.vectors:
-        vector = ca.sparsify(ca.DM(np.array(part.by_length))) @ lengths + ca.DM(part.constant)
-        if part.segment != UNIVERSE:
-            vectors[part.segment] = vector = rotate(quat_WL[part.segment], vector)
-        whole += vector
-    return whole, vectors
+
+    def __init__(
+        self,
+        model: BodyModel,
+        start: StartPose,
+        sensors: Sequence[str],
+        points: Collection[tuple[str, float]],
+        where: str = "",
+    ) -> None:
+        self._model, self._start, self._sensors = model, start, sensors
+        self.vectors: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.girdles: dict[str, float] = {}
+        zero, links = (np.zeros((3, len(model.lengths))), np.zeros(3)), dict[str, tuple[np.ndarray, np.ndarray]]()
+        for point, sign in points:
+            for link, (by_length, constant) in model.reaches[point].items():
+                B, c = links.get(link, zero)
+                links[link] = B + sign * by_length, c + sign * constant
+            for name in model.point_girdles[point]:
+                self.girdles[name] = self.girdles.get(name, 0.0) + sign
+        sums: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        for link, vector in links.items():
+            if not _is_zero(*vector):
+                carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
+                if carrier is None:
+                    places = " and ".join(point for point, _ in points)
+                    raise BadSession(
+                        f"{where}sensors.{link} is missing: without it the place of {places} is not known; add it, or "
+                        f"use a protocol without that point"
+                    )
+                (B, c), R = sums.get(carrier, zero), start.rotation(link)
+                sums[carrier] = B + R @ vector[0], c + R @ vector[1]
+        for carrier in sorted(sums, key=[UNIVERSE, *model.table.segments].index):
+            if not _is_zero(*sums[carrier]):
+                self.vectors[carrier] = sums[carrier]
+        self.girdles = {name: sign for name, sign in self.girdles.items() if sign}
+
+    @property
+    def segments(self) -> list[str]:
+        """Those whose vectors lie on the path."""
+        return [segment for segment in self.vectors if segment != UNIVERSE]
+
+    def express(
+        self, quat_WL: Mapping[str, ca.SX], lengths: ca.SX, girdles: Mapping[str, ca.SX]
+    ) -> tuple[ca.SX, dict[str, ca.SX]]:
+        """Return the path (3,) [m] in W, and its vectors, segment → (3,) [m], without the girdles.
+
+        Parameters
+        ----------
+        quat_WL : segment → (4,) xyzw of L'
+        lengths : (k,) [m], in the order of the table
+        girdles : of those with sensors on both their segments, a person's parameters (7,)
+        """
+        whole, vectors = ca.SX.zeros(3), {}
+        for name, sign in self.girdles.items():
+            if name in girdles:
+                whole += sign * self._displace(name, quat_WL, girdles[name])
+        for segment, (B, c) in self.vectors.items():
+            vector = ca.sparsify(ca.DM(B)) @ lengths + ca.DM(c)
+            if segment != UNIVERSE:
+                vectors[segment] = vector = rotate(quat_WL[segment], vector)
+            whole += vector
+        return whole, vectors
+
+    def _displace(self, name: str, quat_WL: Mapping[str, ca.SX], parameters: ca.SX) -> ca.SX:
+        """Return the displacement (3,) [m] in W of the point that a girdle moves, by a person's parameters (7,)."""
+        table, start = self._model.table, self._start
+        girdle = table.girdles[name]
+        R_on, scale = ca.DM(start.rotation(girdle.on)), girdle.find_scale(self._model.lengths)
+        along_W = rotate(quat_WL[girdle.moves], start.turn(girdle.moves, table.segments[girdle.moves].along))
+        along = R_on.T @ rotate_back(quat_WL[girdle.on], along_W)
+        by_law, raised = displace(girdle, ca.vertsplit(along), scale, ca)
+        own = (1.0 + parameters[0]) * ca.vertcat(*by_law) + parameters[1:4] + raised * parameters[4:]
+        return rotate(quat_WL[girdle.on], R_on @ own)
+
+    def linearize(self, quat_WL: np.ndarray, headings: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Linearize the path, between two points their gap, of orientations (n, k, 4) at heading errors (k,) [rad].
+
+        Returns
+        -------
+        gap : (n, 3) [m] in W
+        H : (n, 3, k) [m/rad] its slope by the headings
+        by_shape : (n, 3, m) by the lengths and the girdles' parameters, as in `Subject.shape_covariance`
+        by_attitude : (n, 3, 3) [m²] its covariance by errors of 1 rad of each orientation about each axis
+        off_law : (n, 3, 3) [m²] its covariance by shoulders that leave the law of their girdles
+        """
+        function, shape = self._linearization
+        gap, *others = evaluate(function, quat_WL.reshape(len(quat_WL), -1), headings, shape)
+        return gap[:, :, 0], *others
+
+    @cached_property
+    def _linearization(self) -> tuple[ca.Function, np.ndarray]:
+        """The rows of a sample as a function of quaternions, headings and shape, and the person's shape."""
+        model, table, k, n = self._model, self._model.table, len(self._sensors), len(self._model.lengths)
+        own_shape = np.concatenate([list(model.lengths.values()), *map(model.girdle_parameters, table.girdles)])
+        quat, headings, shape = ca.SX.sym("quat", 4 * k), ca.SX.sym("headings", k), ca.SX.sym("shape", len(own_shape))
+        parameters = dict(zip(table.girdles, ca.vertsplit(shape[n:], len(PARAMETERS)), strict=True))
+        quat_WL = {name: product(about_z(headings[i]), quat[4 * i : 4 * i + 4]) for i, name in enumerate(self._sensors)}
+        girdles = {name: parameters[name] for name in find_girdles(model, self._sensors)}
+        gap, vectors = self.express(quat_WL, shape[:n], girdles)
+        off_law = ca.SX.zeros(3, 3)
+        for name in self.girdles:
+            girdle = table.girdles[name]
+            for axis, std in zip(self._start.rotation(girdle.on).T, girdle.residual_std, strict=True):
+                off = std * rotate(quat_WL[girdle.on], ca.DM(axis))
+                off_law += off @ off.T
+        by_attitude = express_covariance(vectors, 0.0, dict.fromkeys(vectors, 1.0))
+        rows = [gap, ca.jacobian(gap, headings), ca.jacobian(gap, shape), by_attitude, off_law]
+        outputs = [ca.densify(each) for each in rows]
+        return ca.Function("rows", [quat, headings, shape], outputs, {"cse": True}), own_shape
+
+
+def _is_zero(*vector: np.ndarray) -> bool:
+    return all(bool(np.all(np.abs(part) <= ZERO_LENGTH)) for part in vector)
+
+
+def find_girdles(model: BodyModel, sensors: Collection[str]) -> tuple[str, ...]:
+    """Find the girdles of the body whose two segments both have sensors."""
+    return tuple(name for name, girdle in model.table.girdles.items() if {girdle.on, girdle.moves} <= set(sensors))
 
 
 def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: Mapping[str, float]) -> ca.SX:
@@ -152,7 +228,7 @@ def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: 
 
     Parameters
     ----------
-    vectors : as of `express_path`
+    vectors : as of `PointPath.express`
     slip : [m] one standard deviation, each axis, by which the points do not coincide
     attitude_std : segment → [rad] of its orientation about each axis
     """
@@ -161,113 +237,6 @@ def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: 
         # An error of variance σ² about each axis moves the end by a vector of this covariance.
         covariance += attitude_std[segment] ** 2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
     return covariance
-
-
-def find_path(
-    model: BodyModel, start: StartPose, sensors: Collection[str], points: Collection[tuple[str, float]], where: str = ""
-) -> PointPath:
-    """Find the path of a signed sum of points, its vectors by segments in the order of the table.
-
-    It raises `BadSession` where a link on the path has no sensor, and is not rigid with one that has.
-    """
-    lengths = len(model.lengths)
-    sums: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for point, sign in points:
-        for link, (by_length, constant) in model.reaches[point].items():
-            B, c = links.get(link, (np.zeros((3, lengths)), np.zeros(3)))
-            links[link] = B + sign * by_length, c + sign * constant
-    for link, (by_length, constant) in links.items():
-        if not (np.any(np.abs(by_length) > ZERO_LENGTH) or np.any(np.abs(constant) > ZERO_LENGTH)):
-            continue
-        carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
-        if carrier is None:
-            places = " and ".join(point for point, _ in points)
-            raise BadSession(
-                f"{where}sensors.{link} is missing: without it the place of {places} is not known; add it, or use a "
-                f"protocol without that point"
-            )
-        R = start.rotation(link)
-        B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))
-        sums[carrier] = B + R @ by_length, c + R @ constant
-    vectors = []
-    for carrier in sorted(sums, key=[UNIVERSE, *model.table.segments].index):
-        B, c = sums[carrier]
-        if np.any(np.abs(B) > ZERO_LENGTH) or np.any(np.abs(c) > ZERO_LENGTH):
-            x, y, z = (float(v) for v in c)
-            vectors.append(SegmentVector(carrier, tuple(tuple(row) for row in B.tolist()), (x, y, z)))
-    signs: dict[str, float] = {}
-    for point, sign in points:
-        for name in model.point_girdles[point]:
-            signs[name] = signs.get(name, 0.0) + sign
-    return PointPath(tuple(vectors), tuple((name, sign) for name, sign in signs.items() if sign))
-
-
-def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[GirdleTerm, ...]:
-    """Find the girdles of the body whose two segments both have sensors."""
-    terms = []
-    for name, girdle in model.table.girdles.items():
-        if {girdle.on, girdle.moves} <= set(sensors):
-            along = start.turn(girdle.moves, model.table.segments[girdle.moves].along)
-            R_on = tuple(float(v) for v in start.rotation(girdle.on).ravel())
-            terms.append(GirdleTerm(name, girdle, along, R_on, girdle.find_scale(model.lengths)))
-    return tuple(terms)
-
-
-class PointPair:
-    """Two points of a body that coincide at times.
-
-    Parameters
-    ----------
-    model, start : the body, with a person's lengths and girdles, and its start pose
-    sensors : k segments with sensors
-    points : the two
-
-    Attributes
-    ----------
-    segments : names of those whose vectors lie between the points
-
-    Raises
-    ------
-    BadSession
-        The place of a point is not known.
-    """
-
-    def __init__(self, model: BodyModel, start: StartPose, sensors: Sequence[str], points: tuple[str, str]) -> None:
-        self.points = points
-        between = find_path(model, start, sensors, [(points[0], 1.0), (points[1], -1.0)])
-        self.segments = tuple(part.segment for part in between.vectors if part.segment != UNIVERSE)
-        table, k, n = model.table, len(sensors), len(model.lengths)
-        self._shape = np.concatenate([list(model.lengths.values()), *map(model.girdle_parameters, table.girdles)])
-        quat, headings, shape = ca.SX.sym("quat", 4 * k), ca.SX.sym("headings", k), ca.SX.sym("shape", len(self._shape))
-        parameters = dict(zip(table.girdles, ca.vertsplit(shape[n:], len(PARAMETERS)), strict=True))
-        quat_WL = {name: product(about_z(headings[i]), quat[4 * i : 4 * i + 4]) for i, name in enumerate(sensors)}
-        girdles = {term.name: (term, parameters[term.name]) for term in find_girdles(model, start, sensors)}
-        gap, vectors = express_path(between, quat_WL, shape[:n], girdles)
-        off_law = ca.SX.zeros(3, 3)
-        for name, _ in between.girdles:
-            girdle = table.girdles[name]
-            for axis, std in zip(start.rotation(girdle.on).T, girdle.residual_std, strict=True):
-                off = std * rotate(quat_WL[girdle.on], ca.DM(axis))
-                off_law += off @ off.T
-        by_attitude = express_covariance(vectors, 0.0, dict.fromkeys(vectors, 1.0))
-        rows = [gap, ca.jacobian(gap, headings), ca.jacobian(gap, shape), by_attitude, off_law]
-        outputs = [ca.densify(each) for each in rows]
-        self._gap = ca.Function("rows", [quat, headings, shape], outputs, {"cse": True})
-
-    def linearize(self, quat_WL: np.ndarray, headings: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Linearize the gap of orientations (n, k, 4) at heading errors (k,) [rad].
-
-        Returns
-        -------
-        gap : (n, 3) [m] in W, from the second point to the first one
-        H : (n, 3, k) [m/rad] its slope by the headings
-        by_shape : (n, 3, m) by the lengths and the girdles' parameters, as in `Subject.shape_covariance`
-        by_attitude : (n, 3, 3) [m²] its covariance by errors of 1 rad of each orientation about each axis
-        off_law : (n, 3, 3) [m²] its covariance by shoulders that leave the law of their girdles
-        """
-        gap, *others = evaluate(self._gap, quat_WL.reshape(len(quat_WL), -1), headings, self._shape)
-        return gap[:, :, 0], *others
 
 
 # Hinges ---------------------------------------------------------------------------------------------------------------

@@ -87,7 +87,7 @@ def _name_gap(calibration: Calibration) -> str:
 
 def _describe_reliance(calibration: Calibration) -> str:
     """Two sentences: how well the lengths are known, and the mounts."""
-    subject, chain = calibration.subject, calibration.problem.lengths_in_closures
+    subject, chain = calibration.subject, calibration.problem.layout.lengths_in_closures
     stds = {name: std for name in chain or subject.lengths if np.isfinite(std := 1e3 * subject.std(name))}
     text = "The uncertainty of the lengths is not known."
     if stds:
@@ -108,11 +108,13 @@ def _describe_lengths(calibration: Calibration) -> str:
     """Which of the lengths the motion determines, and which it does not."""
     subject, problem = calibration.subject, calibration.problem
     text = "± is one standard deviation throughout: two times out of three the truth lies within."
-    if problem.lengths_in_closures and np.isfinite(calibration.scale_std):
+    if problem.layout.lengths_in_closures and np.isfinite(calibration.scale_std):
         measured = listed([plain(name) for name in problem.scale_lengths])
         scale = f"comes from the measured {measured}" if measured else "is that of the prior"
         text += f" The motion determines the proportions of the lengths. Their common scale {scale}."
-    outside = [plain(n) for n in subject.lengths if n not in problem.lengths_in_closures and n not in problem.measured]
+    outside = [
+        plain(n) for n in subject.lengths if n not in problem.layout.lengths_in_closures and n not in problem.measured
+    ]
     if outside:
         text += f" Not in the chain, known by the prior's proportions alone: {', '.join(outside)}."
     return text
@@ -128,7 +130,7 @@ def tabulate_lengths(calibration: Calibration) -> Table:
             for person in (subject, problem.prior)
         )
         variance = subject.std(name) ** 2 - (calibration.scale_std * value) ** 2
-        in_chain = name in problem.lengths_in_closures and np.isfinite(variance)
+        in_chain = name in problem.layout.lengths_in_closures and np.isfinite(variance)
         proportion = spread(1e3 * np.sqrt(max(variance, 0.0)), 0) if in_chain else ""
         measured = number(1e3 * problem.measured[name][0], 0) if name in problem.measured else ""
         rows.append([plain(name), f"**{estimated}**", proportion, before, measured])

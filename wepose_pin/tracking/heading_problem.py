@@ -19,7 +19,7 @@ from ..body.subject import Subject
 from ..calibration import load_protocol
 from ..errors import BadSession
 from ..filters.noise import SensorNoise
-from ..observations.expressions import HingePlane, PointPair, find_hinges
+from ..observations.expressions import HingePlane, PointPath, find_hinges
 from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
 from ..recording import Recording
 
@@ -83,7 +83,7 @@ class HeadingProblem:
     # (h, 3) [rad] of each hinge's axis about the long axis of the segment above and across, as in `HeadingNoise`, and
     # of the angle between its plane and the segment below.
     hinge_std: np.ndarray
-    palms: PointPair | None  # which the phase `CLASP` joins
+    palms: PointPath | None  # which the phase `CLASP` joins
     noise: HeadingNoise
     sensor_rate_hz: float
     stride: int  # sensors' samples from one sample of a knot to the next
@@ -143,7 +143,7 @@ def make_heading_problem(
     palms, (left, right) = None, closure.points
     if {left, right} <= set(model.table.points):
         with contextlib.suppress(BadSession):  # the sensors do not tell where they are
-            palms = PointPair(model, start, names, (left, right))
+            palms = PointPath(model, start, names, ((left, 1.0), (right, -1.0)))
     if not (pairs or hinges or (palms and recording.phases.get(CLASP))):
         return None
     stride = max(1, round(rate_hz / SAMPLE_RATE_HZ))
