@@ -50,68 +50,93 @@ class SmekfParams(FilterParams):
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
 
 
-# P is symmetric; each entry is computed once, with `fma`: that is most of the time of a step.
+# P = [[A, C], [Cᵀ, B]] of errors a in V and b in S. A matrix (3, 3) is nine floats, rows first, which stay in
+# the processor's registers; what is not read of a product is not computed.
 
 
 @inlined
-def _predict(state, model, lost_var):  # type: ignore[no-untyped-def]
-    """Algorithm 1, prediction: P ← F P Fᵀ + Q with F = [[I, −δt R_VS], [0, I]] of errors a in V and b in S."""
-    P, R, dt = state.P, state.R_VS, model.dt
-    for i in range(3):
-        x, y, z = dt * R[i, 0], dt * R[i, 1], dt * R[i, 2]
-        for j in range(i, 3):
-            P[i, j] = fma(-x, P[j, 3], fma(-y, P[j, 4], fma(-z, P[j, 5], P[i, j])))
-    for i in range(3):
-        x, y, z = dt * R[i, 0], dt * R[i, 1], dt * R[i, 2]
-        for j in range(3, 6):
-            P[i, j] = fma(-x, P[3, j], fma(-y, P[4, j], fma(-z, P[5, j], P[i, j])))
-            P[j, i] = P[i, j]
-    for i in range(3):
-        x, y, z = dt * P[i, 3], dt * P[i, 4], dt * P[i, 5]
-        for j in range(i, 3):
-            P[i, j] = fma(-x, R[j, 0], fma(-y, R[j, 1], fma(-z, R[j, 2], P[i, j])))
-            P[j, i] = P[i, j]
-        P[i, i] += model.attitude_var + lost_var
-        P[3 + i, 3 + i] += model.bias_var
+def _read(row):  # type: ignore[no-untyped-def]
+    return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8]
 
 
 @inlined
-def _correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+def _add_scaled(a, s, v):  # type: ignore[no-untyped-def]
+    """``a + s v`` of three floats each."""
+    return fma(s, v[0], a[0]), fma(s, v[1], a[1]), fma(s, v[2], a[2])
+
+
+@inlined
+def _add_outer(A, u, v):  # type: ignore[no-untyped-def]
+    """``A + u vᵀ``."""
+    return _add_scaled(A[0:3], u[0], v) + _add_scaled(A[3:6], u[1], v) + _add_scaled(A[6:9], u[2], v)
+
+
+@inlined
+def _add_product(A, B, C):  # type: ignore[no-untyped-def]
+    """``A + B C``: a column of B times a row of C for each."""
+    A = _add_outer(A, (B[2], B[5], B[8]), C[6:9])
+    A = _add_outer(A, (B[1], B[4], B[7]), C[3:6])
+    return _add_outer(A, (B[0], B[3], B[6]), C[0:3])
+
+
+@inlined
+def _transpose(A):  # type: ignore[no-untyped-def]
+    return A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]
+
+
+@inlined
+def _symmetric(A, variance):  # type: ignore[no-untyped-def]
+    """``A + variance I`` by the upper half of A."""
+    return A[0] + variance, A[1], A[2], A[1], A[4] + variance, A[5], A[2], A[5], A[8] + variance
+
+
+@inlined
+def _scale(s, u):  # type: ignore[no-untyped-def]
+    return s * u[0], s * u[1], s * u[2]
+
+
+@inlined
+def _predict(A, C, B, R, model, lost_var):  # type: ignore[no-untyped-def]
+    """Algorithm 1, prediction: P ← F P Fᵀ + Q with F = [[I, −δt R_VS], [0, I]]."""
+    F = _scale(-model.dt, R[0]) + _scale(-model.dt, R[1]) + _scale(-model.dt, R[2])
+    A = _add_product(A, F, _transpose(C))
+    C = _add_product(C, F, B)
+    A = _add_product(A, C, _transpose(F))
+    return _symmetric(A, model.attitude_var + lost_var), C, _symmetric(B, model.bias_var)
+
+
+@inlined
+def _fuse(A, C, B, a, b, p, c, innovation, variance):  # type: ignore[no-untyped-def]
+    """Correct by a measurement of one state, whose covariances with a and b are p and c: P ← P − [p; c] [p; c]ᵀ/s."""
+    share = 1.0 / variance
+    gain, u, w = share * innovation, _scale(-share, p), _scale(-share, c)
+    A, C, B = _symmetric(_add_outer(A, u, p), 0.0), _add_outer(C, u, c), _symmetric(_add_outer(B, w, c), 0.0)
+    return A, C, B, _add_scaled(a, gain, p), _add_scaled(b, gain, c)
+
+
+@inlined
+def _correct(A, C, B, state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
     """Algorithm 1, correction in a static phase, by one measurement after the other.
 
     y = [R_VS accel/g; gyro], h = [e_z; b̂], H = [[[e_z]×, 0], [0, I]] of errors in V. A correction of the attitude does
     not change e_z, so that P, whose long axis is the heading, need not follow it. The vertical part of accel measures
     nothing of the state.
     """
-    P, x, R, bias, g = state.P, state.x, state.R_VS, state.gyro_bias, model.inverse_gravity
-    for i in range(6):
-        x[i] = 0.0
-    _fuse(P, x, 3, model.static_gyro_var, gx - bias[0])
-    _fuse(P, x, 4, model.static_gyro_var, gy - bias[1])
-    _fuse(P, x, 5, model.static_gyro_var, gz - bias[2])
-    _fuse(P, x, 1, model.static_accel_var, -g * (R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az))
-    _fuse(P, x, 0, model.static_accel_var, g * (R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az))
-    P[2, 2] += model.static_turn_var
-    state.about_vertical[HEADING] += x[2]
+    R, bias, g, s, v = state.R_VS, state.gyro_bias, model.inverse_gravity, model.static_gyro_var, model.static_accel_var
+    a, b = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    A, C, B, a, b = _fuse(A, C, B, a, b, (C[0], C[3], C[6]), B[0:3], gx - bias[0], B[0] + s)
+    A, C, B, a, b = _fuse(A, C, B, a, b, (C[1], C[4], C[7]), B[3:6], gy - bias[1] - b[1], B[4] + s)
+    A, C, B, a, b = _fuse(A, C, B, a, b, (C[2], C[5], C[8]), B[6:9], gz - bias[2] - b[2], B[8] + s)
+    x, y = g * (R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az), g * (R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az)
+    A, C, B, a, b = _fuse(A, C, B, a, b, A[3:6], C[3:6], -x - a[1], A[4] + v)
+    A, C, B, a, b = _fuse(A, C, B, a, b, A[0:3], C[0:3], y - a[0], A[0] + v)
+    state.about_vertical[HEADING] += a[2]
     for i in range(3):
-        state.about_vertical[RATE] += R[2, i] * x[3 + i]
-        bias[i] += x[3 + i]
-    rotate_by_world_vector(state.quat_VS, x[0], x[1], x[2])
+        state.about_vertical[RATE] += R[2, i] * b[i]
+        bias[i] += b[i]
+    rotate_by_world_vector(state.quat_VS, a[0], a[1], a[2])
     fill_matrix(state.quat_VS, R)
-
-
-@inlined
-def _fuse(P, x, at, variance, measured):  # type: ignore[no-untyped-def]
-    """Correct by a measurement of one state, P h = p, s its variance: x ← x + p y/s and P ← P − p pᵀ/s."""
-    share = 1.0 / (P[at, at] + variance)
-    gain = share * (measured - x[at])
-    p = (P[at, 0], P[at, 1], P[at, 2], P[at, 3], P[at, 4], P[at, 5])
-    for i in range(6):
-        x[i] += gain * p[i]
-        factor = share * p[i]
-        for j in range(i, 6):
-            P[i, j] = fma(-factor, p[j], P[i, j])
-            P[j, i] = P[i, j]
+    return A[0:8] + (A[8] + model.static_turn_var,), C, B
 
 
 @kernel
@@ -120,27 +145,29 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
     quat, bias, R, P, vertical, dt = (
         state.quat_VS, state.gyro_bias, state.R_VS, state.P, state.about_vertical, model.dt
     )  # fmt: skip
+    A, C, B = _read(P[0]), _read(P[1]), _read(P[2])
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
         wx, wy, wz, is_measured, lost_var = bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
         rotate_unit_by_rate(quat, wx, wy, wz, dt)
         fill_matrix(quat, R)
-        _predict(state, model, lost_var)
+        A, C, B = _predict(A, C, B, R, model, lost_var)
         if static[k] and is_measured and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
-            _correct(state, model, gx, gy, gz, ax, ay, az)
+            A, C, B = _correct(A, C, B, state, model, gx, gy, gz, ax, ay, az)
         # A scale of the gyroscope that is wrong by s gives the heading an error of s times the rotation about the
         # vertical. The scale is no part of the filter's state, as in the paper.
         state.turned += dt * (R[2, 0] * wx + R[2, 1] * wy + R[2, 2] * wz)
-        attitude = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2], P[2, 0], P[2, 1], P[2, 2]
-        into_sensor(R, attitude, 0.0, model.scale_var * state.turned * state.turned, out_cov[k])
+        into_sensor(R, A, 0.0, model.scale_var * state.turned * state.turned, out_cov[k])
         x, y, z = R[2, 0], R[2, 1], R[2, 2]
-        vertical[RATE_VAR] = P[3, 3] * x * x + P[4, 4] * y * y + P[5, 5] * z * z
-        vertical[RATE_VAR] += 2.0 * (P[3, 4] * x * y + P[3, 5] * x * z + P[4, 5] * y * z)
+        vertical[RATE_VAR] = B[0] * x * x + B[4] * y * y + B[8] * z * z
+        vertical[RATE_VAR] += 2.0 * (B[1] * x * y + B[2] * x * z + B[5] * y * z)
         for i in range(3):
             out_bias[k, i], out_vertical[k, i] = bias[i], vertical[i]
         for i in range(4):
             out_quat[k, i] = quat[i]
+    for i in range(9):
+        P[0, i], P[1, i], P[2, i] = A[i], C[i], B[i]
 
 
 class Smekf(OrientationFilter):
@@ -154,14 +181,13 @@ class Smekf(OrientationFilter):
 
     def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         noise, p, rate_hz = self.noise, self.params, self.rate_hz
-        P = np.zeros((6, 6))
-        np.fill_diagonal(P, np.square([p.tilt_std, p.tilt_std, START_HEADING_STD, 0.0, 0.0, 0.0]))
-        P[3:, 3:] = noise.gyro_bias_cov
+        P = np.zeros((3, 9))
+        P[0, [0, 4, 8]] = np.square([p.tilt_std, p.tilt_std, START_HEADING_STD])
+        P[2] = noise.gyro_bias_cov.ravel()
         state = make_record(
             quat_VS=quat_VS,  # (4,) xyzw
             gyro_bias=noise.gyro_bias,  # (3,) [rad/s]
-            P=P,  # of a in V [rad] and b in S [rad/s]
-            x=np.zeros(6),  # their correction
+            P=P,  # A, C, B of a in V [rad] and b in S [rad/s]
             turned=0.0,  # [rad] net rotation about the vertical since the start
             last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
             lost_s=0.0,  # [s] the same

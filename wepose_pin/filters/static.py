@@ -214,11 +214,11 @@ def _rate_is_steady(state, model, tail):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _bias_agrees(state, model, n):  # type: ignore[no-untyped-def]
+def _bias_agrees(state, model, n, share):  # type: ignore[no-untyped-def]
     """Condition (5) for a window of n samples that passes the others; learns the bias."""
     bias, anchor, window = state.bias, state.anchor, state.window
-    gx, gy, gz = anchor[0] + window[0] / n, anchor[1] + window[1] / n, anchor[2] + window[2] / n
-    ax, ay, az = anchor[3] + window[3] / n, anchor[4] + window[4] / n, anchor[5] + window[5] / n
+    gx, gy, gz = anchor[0] + window[0] * share, anchor[1] + window[1] * share, anchor[2] + window[2] * share
+    ax, ay, az = anchor[3] + window[3] * share, anchor[4] + window[4] * share, anchor[5] + window[5] * share
     gx, gy, gz = gx - bias[0], gy - bias[1], gz - bias[2]
     off = (gx * ax + gy * ay + gz * az) / np.sqrt(ax * ax + ay * ay + az * az)
     known = state.bias_var + model.spread_var
@@ -292,6 +292,6 @@ def _run(states, models, block, tail, gyro_S, accel_S, static):  # type: ignore[
                 and _is_within(window, limits[1], 1, share)  # (2)
                 and _rate_is_steady(state, model, tail)  # (6)
             ):
-                static[k] = _bias_agrees(state, model, len(block))  # (5)
+                static[k] = _bias_agrees(state, model, len(block), share)  # (5)
                 continue
         state.average_rate -= model.fade * state.average_rate

@@ -138,6 +138,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     """
     faults: dict[str, list[Fault]] = {}
     for name, (time, gyro_S, accel_S) in samples.items():
+        if not (_repeats(gyro_S) or _repeats(accel_S)):
+            continue
         covered = np.zeros(len(time), dtype=bool)
         of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
         for signals, columns, repeats, least_s in (
@@ -145,10 +147,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             (GYRO, (gyro_S,), of_gyro, STUCK_S),
             (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
-            count = max(0, len(repeats) - FROZEN_SAMPLES + 2)
-            if not np.logical_and.reduce([repeats[k : k + count] for k in range(FROZEN_SAMPLES - 1)]).any():
-                continue
-            first, last = np.array(find_runs(repeats)).T - 1
+            first, last = np.array(find_runs(repeats), dtype=int).reshape(-1, 2).T - 1
             length = last - first + 1
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             if not long.any():
@@ -186,6 +185,21 @@ def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
     for signal in signals:
         _unmark_changes(np.ascontiguousarray(signal), repeats)
     return repeats
+
+
+@kernel
+def _repeats(values):  # type: ignore[no-untyped-def]
+    """Return whether `FROZEN_SAMPLES` rows in a row have the same values, by one pair of so many."""
+    for row in range(1, len(values), FROZEN_SAMPLES - 1):
+        if is_same(values[row - 1], values[row]):
+            first = last = row
+            while first > 0 and is_same(values[first - 1], values[row]):
+                first -= 1
+            while last < len(values) and is_same(values[last], values[row]):
+                last += 1
+            if last - first >= FROZEN_SAMPLES:
+                return True
+    return False
 
 
 @kernel
@@ -246,9 +260,10 @@ def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
 
 def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
     """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
-    state = start_saturation()
-    if max(values.max(initial=0.0), -values.min(initial=0.0)) >= least:
-        _watch_all(state, np.ascontiguousarray(values), least)
+    state, values = start_saturation(), np.ascontiguousarray(values)
+    largest = max(values.max(initial=0.0), -values.min(initial=0.0))
+    if _may_saturate(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * largest)):
+        _watch_all(state, values, least)
     return np.asarray(state["level"][0])
 
 
@@ -257,6 +272,19 @@ def start_saturation() -> np.ndarray:
     state = np.zeros(1, SATURATION)
     state["digit"] = state["level"] = np.inf
     return state
+
+
+@kernel
+def _may_saturate(values, least):  # type: ignore[no-untyped-def]
+    """Return whether an axis has the same value, `least` or more, in `SHORT_PLATEAU` rows: most signals never do."""
+    for k in range(3):
+        stands = 1
+        for row in range(1, len(values)):
+            size, step = abs(values[row, k]), abs(values[row, k] - values[row - 1, k])
+            stands = stands + 1 if size >= least and step <= 2.0 * ROUNDING * size else 1
+            if stands == SHORT_PLATEAU:
+                return True
+    return False
 
 
 @kernel
