@@ -49,13 +49,13 @@ MT_RAW = [f"{kind}_{axis}" for kind in ("Acc", "Gyr") for axis in "XYZ"]
 
 
 def mt_manager(
-    path: Path, *, separator: str = "\t", decimal: str = ".", preamble: str = PREAMBLE, first: int = 0, raw: bool = True
+    path: Path, *, separator: str = "\t", decimal: str = ".", preamble: str = PREAMBLE, first: int = 0
 ) -> Path:
     matrix = R_WS.as_matrix().transpose(0, 2, 1).reshape(N, 9)  # columns of the matrix one after the other
-    names = ["PacketCounter", "SampleTimeFine", *(MT_RAW if raw else [])]
+    names = ["PacketCounter", "SampleTimeFine", *MT_RAW]
     names += [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
     columns: list[Any] = [[f"{(first + k) % 65536:05d}" for k in range(N)], [""] * N]
-    columns += [*own(ACCEL, path).T, *GYRO.T, *matrix.T] if raw else [*matrix.T]
+    columns += [*own(ACCEL, path).T, *GYRO.T, *matrix.T]
     path.write_text(preamble + separator.join(names) + "\n" + rows(columns, separator, decimal), encoding="utf-8")
     return path
 
@@ -78,14 +78,12 @@ def apdm(path: Path) -> Path:
 
 def apdm_by_name(path: Path) -> Path:
     """As before ``Format=7``."""
-    names = [
-        f"Chest/{kind}/{axis}" for kind in ("Acceleration", "Angular Velocity", "Magnetic Field") for axis in "XYZ"
-    ]
+    kinds = ("Acceleration", "Angular Velocity", "Magnetic Field")
+    names = [f"Chest/{kind}/{axis}" for kind in kinds for axis in "XYZ"]
     names += [f"Chest/Orientation/{axis}" for axis in ("Scalar", "X", "Y", "Z")]
     units = ["s", *["m/s^2"] * 3, *["deg/s"] * 3, *["uT"] * 3, *[""] * 4]
     head = f"Test Name:,walk,,\nSample Rate:,100,Hz,\n{','.join(['Time', *names])}\n{','.join(units)}\n"
-    magnetic = [np.zeros(N)] * 3
-    path.write_text(head + rows([TIME, *ACCEL.T, *np.degrees(GYRO).T, *magnetic, *WXYZ.T]))
+    path.write_text(head + rows([TIME, *ACCEL.T, *np.degrees(GYRO).T, *[np.zeros(N)] * 3, *WXYZ.T]))
     return path
 
 
@@ -130,13 +128,11 @@ def ximu3(folder: Path, first_us: int = 52100347) -> Path:
     return folder
 
 
-def sto(path: Path, kind: str = "Quaternion", labels: tuple[str, ...] = ("torso_imu", "humerus_r_imu")) -> Path:
+def sto(path: Path, labels: tuple[str, ...] = ("torso_imu", "humerus_r_imu")) -> Path:
+    head = "DataRate=100.000000\nDataType=Quaternion\nversion=3\nOpenSimVersion=4.4\nendheader\n"
     cells = [",".join(f"{value:.9f}" for value in quat) for quat in WXYZ]
-    head = f"DataRate=100.000000\nDataType={kind}\nversion=3\nOpenSimVersion=4.4\nendheader\n"
-    names = "\t".join(["time", *labels]) + "\n"
-    path.write_text(
-        head + names + "".join(f"{t:.6f}" + f"\t{c}" * len(labels) + "\n" for t, c in zip(TIME, cells, strict=True))
-    )
+    columns = [[f"{t:.6f}" for t in TIME], *[cells] * len(labels)]
+    path.write_text(head + table_text(columns, ["time", *labels], "\t"))
     return path
 
 
@@ -159,16 +155,9 @@ def shimmer(path: Path, separator: str = ";", scale: float = 1.0, dates: bool = 
     names = ["TimestampSync_FormattedUnix" if dates else "Timestamp_Unix"]
     names += [f"Accel_{kind}_{a}" for kind in ("LN", "WR") for a in AXES] + ["Battery"]
     names += [f"{kind}_{a}" for kind in ("Gyro", "Mag") for a in AXES]
-    units = [
-        "yyyy/mm/dd hh:mm:ss.000" if dates else "ms",
-        *["m/(s^2)"] * 6,
-        "mV",
-        *["deg/s"] * 3,
-        *["local_flux"] * 3,
-    ]
-    stamps = [f"{1e-3 * US0 + 10 * k:.1f}" for k in range(N)]
-    if dates:
-        stamps = [f"2026/03/12 08:00:{0.01 * k:06.3f}" for k in range(N)]
+    units = ["yyyy/mm/dd hh:mm:ss.000" if dates else "ms", *["m/(s^2)"] * 6, "mV", *["deg/s"] * 3, *["local_flux"] * 3]
+    date = "2026/03/12 08:00:{:06.3f}"
+    stamps = [date.format(0.01 * k) if dates else f"{1e-3 * US0 + 10 * k:.1f}" for k in range(N)]
     noise = own(ACCEL, path)
     columns = [stamps, *(scale * noise).T, *(noise + 0.1).T, np.full(N, 4100.0), *np.degrees(GYRO).T, *ACCEL.T]
     head = f'"sep={separator}"\n' + separator.join([*(f"Shimmer_8665_{n}_CAL" for n in names), ""]) + "\n"
@@ -207,20 +196,12 @@ def delsys(path: Path, separator: str = ",", decimal: str = ".") -> Path:
         for channel, column in zip(channels, values, strict=True):
             kinds += [f"{channel.rpartition(' (')[0]} Time Series (s)", channel]
             filled = [f"{v:.9g}" for v in column] + [""] * (10 * N - len(column))
-            columns += [
-                [f"{k / (10 if len(column) > N else 1) / RATE:.6f}" if v else "" for k, v in enumerate(filled)],
-                filled,
-            ]
-    lines = [
-        "Application:" + separator + "Trigno Discover (2.1.0.7)",
-        "Date/Time:" + separator + "x",
-        "Length:" + separator + "4",
-    ]
-    lines += [
-        f"{separator} ".join(head),
-        separator.join("sensor mode: 609" if c else "" for c in head),
-        f"{separator} ".join(kinds),
-    ]
+            rate_hz = RATE * (10 if len(column) > N else 1)
+            columns += [[f"{k / rate_hz:.6f}" if v else "" for k, v in enumerate(filled)], filled]
+    about = {"Application": "Trigno Discover (2.1.0.7)", "Date/Time": "x", "Length": "4"}
+    lines = [f"{key}:{separator}{value}" for key, value in about.items()]
+    modes = separator.join("sensor mode: 609" if c else "" for c in head)
+    lines += [f"{separator} ".join(head), modes, f"{separator} ".join(kinds)]
     lines += [separator.join([""] + ["1000 Hz" if k % 2 else "" for k in range(1, len(kinds))])] * 2
     path.write_text("\n".join(lines) + "\n" + rows(columns, separator, decimal))
     return path
@@ -254,8 +235,7 @@ def sensor_logger(folder: Path, platform: str = "android", late: float = 0.0, gr
         [stamps, TIME, *WXYZ[:, ::-1].T, TIME, TIME, TIME], [*names, "qz", "qy", "qx", "qw", "roll", "pitch", "yaw"]
     )
     (folder / "Orientation.csv").write_text(quat)
-    about = f"version,device name,platform,standardisation\n3,phone,{platform},false\n"
-    (folder / "Metadata.csv").write_text(about)
+    (folder / "Metadata.csv").write_text(f"version,device name,platform,standardisation\n3,phone,{platform},false\n")
     return folder
 
 
@@ -270,21 +250,18 @@ def phyphox(folder: Path, separator: str = ",", decimal: str = ".", gyro: str = 
     return folder
 
 
-def rosbag(path: Path, mcap: bool = False, frames: bool = False, raw: bool = True, version: int = 9) -> Path:
+def rosbag(path: Path, mcap: bool = False, frames: bool = False, raw: bool = True) -> Path:
     """Two IMUs, one of which begins later; as topics, or as frames of one topic."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    Imu, Header, Stamp = (
-        types[f"{name}"] for name in ("sensor_msgs/msg/Imu", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
-    )
-    Vector, Quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-    covariance = np.zeros(9)
-    unknown = np.array([-1.0, *np.zeros(8)])
+    messages = ("sensor_msgs", "Imu"), ("std_msgs", "Header"), ("builtin_interfaces", "Time")
+    Imu, Header, Stamp = (store.types[f"{package}/msg/{name}"] for package, name in messages)
+    Vector, Quaternion = (store.types[f"geometry_msgs/msg/{name}"] for name in ("Vector3", "Quaternion"))
+    covariance, unknown = np.zeros(9), np.array([-1.0, *np.zeros(8)])
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
-    with Writer(path, version=version, storage_plugin=plugin) as writer:
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
         topics = ["/imu"] if frames else ["/torso/imu", "/left_forearm/imu"]
         connections = [writer.add_connection(topic, Imu.__msgtype__, typestore=store) for topic in topics]
         for k in range(N):
@@ -293,18 +270,11 @@ def rosbag(path: Path, mcap: bool = False, frames: bool = False, raw: bool = Tru
                     continue
                 ns = 1000 * US0 + 10_000_000 * k
                 accel = own(ACCEL, path)[k] if which else ACCEL[k]
-                message = Imu(
-                    Header(Stamp(ns // 10**9, ns % 10**9), frame),
-                    Quaternion(*WXYZ[k, [1, 2, 3, 0]]),
-                    covariance if which == 0 or not raw else unknown,
-                    Vector(*GYRO[k]),
-                    covariance if raw else unknown,
-                    Vector(*accel),
-                    covariance,
-                )
-                writer.write(
-                    connections[0 if frames else which], ns + 777, store.serialize_cdr(message, Imu.__msgtype__)
-                )
+                turn = Quaternion(*WXYZ[k, [1, 2, 3, 0]]), covariance if which == 0 or not raw else unknown
+                rate = Vector(*GYRO[k]), covariance if raw else unknown
+                message = Imu(Header(Stamp(ns // 10**9, ns % 10**9), frame), *turn, *rate, Vector(*accel), covariance)
+                data = store.serialize_cdr(message, Imu.__msgtype__)
+                writer.write(connections[0 if frames else which], ns + 777, data)
     return path
 
 
@@ -343,26 +313,15 @@ def xdf(path: Path, streams: dict[str, tuple[list[str], list[str], np.ndarray]],
 LABELS = [f"{kind}_{a}" for kind in ("acc", "gyr") for a in "xyz"]
 
 
-SI = ["m/s^2"] * 3 + ["rad/s"] * 3
-
-
 def two_streams(path: Path, cut: int = 0) -> Path:
-    """One in g and °/s, with both sensors' channels in one stream; one in SI."""
-    one = np.column_stack([own(ACCEL, Path("a")) / G, np.degrees(GYRO)])
-    return xdf(
-        path,
-        {
-            "left_wrist": (LABELS, ["g"] * 3 + ["deg/s"] * 3, one),
-            "Sternum": (LABELS, SI, np.column_stack([ACCEL, GYRO])),
-        },
-        cut,
-    )
+    """One in g and °/s, one in SI."""
+    one, other = np.column_stack([own(ACCEL, Path("a")) / G, np.degrees(GYRO)]), np.column_stack([ACCEL, GYRO])
+    units = [["g"] * 3 + ["deg/s"] * 3, ["m/s^2"] * 3 + ["rad/s"] * 3]
+    return xdf(path, {"left_wrist": (LABELS, units[0], one), "Sternum": (LABELS, units[1], other)}, cut)
 
 
 MVN_SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
-
-
-HEAD = '<mvnx version="{version}"><mvn version="x"/><subject frameRate="{rate}" segmentCount="6">'
+MVN_IDENTITY = "1 0 0 0 " * len(MVN_SEGMENTS)
 
 
 def mvnx(
@@ -371,22 +330,17 @@ def mvnx(
     *,
     raw: bool = False,
     version: str = "3",
-    rate: str = "50",
     index: list[int] | None = None,
-    before: str = "",
-    end: str = "</frames></subject></mvnx>",
-    t_pose: str | None = "1 0 0 0 " * len(MVN_SEGMENTS),
+    t_pose: str | None = MVN_IDENTITY,
 ) -> Path:
     """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z.
 
     `t_pose`: the orientations in its frame of type tpose; None: it has no such frame.
     """
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
+    lines = [f'<mvnx version="{version}"><mvn version="x"/><subject frameRate="50" segmentCount="6"><segments>']
     lines += [f'<segment label="{name}" id="{k}"><points/></segment>' for k, name in enumerate(MVN_SEGMENTS, 1)]
     lines += ["</segments><sensors>", '<sensor label="T8"/><sensor label="LeftForeArm"/>', "</sensors><frames>"]
-    poses = {"npose" if version == "2" else "identity": "1 0 0 0 " * len(MVN_SEGMENTS)}
-    if t_pose is not None:
-        poses["tpose"] = t_pose
+    poses = {"npose" if version == "2" else "identity": MVN_IDENTITY} | ({"tpose": t_pose} if t_pose else {})
     lines += [f'<frame type="{pose}"><orientation>{quats}</orientation></frame>' for pose, quats in poses.items()]
     for k, quats in enumerate(quat_wxyz):
         number = k if index is None else index[k]
@@ -396,7 +350,7 @@ def mvnx(
             lines.append(f"<sensorAcceleration>{1e-3 * (k % 3)} 0 9.81 {1e-3 * (k % 2)} 9.81 0</sensorAcceleration>")
             lines.append(f"<sensorAngularVelocity>{0.1 + 1e-4 * (k % 2)} 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
         lines.append("</frame>")
-    (folder / "trial.mvnx").write_text("\n".join([*lines, end]), encoding="utf-8")
+    (folder / "trial.mvnx").write_text("\n".join([*lines, "</frames></subject></mvnx>"]), encoding="utf-8")
     return folder / "trial.mvnx"
 
 

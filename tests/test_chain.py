@@ -298,21 +298,6 @@ def test_a_subject_of_a_body_without_lengths(urdf: Path, tmp_path: Path) -> None
         track(replace(recording, sensors={"torso": recording.sensors["forearm_link"]}, start_pose="n_pose"), person)
 
 
-def test_a_result_on_another_body_does_not_stay(urdf: Path, data: Path, tmp_path: Path) -> None:
-    """Its table and its joints would be read with the next result in the same folder."""
-    write_ur5_session(data, "circle-100", tmp_path)
-    out = tmp_path / "out"
-    assert run("track", tmp_path, "--model", urdf, "--no-view", "--no-report", "-o", out) == 0
-    assert (out / "model.toml").is_file()
-    assert (out / "joints.parquet").is_file()
-    (tmp_path / "person").mkdir()
-    write_session(tmp_path / "person", replace(t_pose_recording(), start_pose="n_pose"))
-    assert run("track", tmp_path / "person", "--no-view", "--no-report", "--force", "-o", out) == 0
-    assert not (out / "model.toml").exists()
-    assert not (out / "joints.parquet").exists()
-    assert not load_result(out).model.table.is_mechanism
-
-
 def test_a_person_may_begin_in_another_pose() -> None:
     """Segment frames are W's in the N-pose; in the T-pose the arms' are turned by a right angle."""
     recording = t_pose_recording()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.targets import TARGETS, WORDS, Target, try_one
+from fuzz_targets import TARGETS, WORDS, Target, try_one
 
 WORD = re.compile(rb'[\w.+-]+|"[^"]*"')
 EXAMPLES = {"retarget": 8}  # of a target that takes its time

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 from commands import run
-from fuzz import seeds
-from fuzz.targets import TARGETS, try_one
+from fuzz_targets import SESSION, TARGETS, live_log, pose, try_one
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin import BadData, BadModel, BadOption, BadSession, BadSubject, MissingFile, WeposeError
@@ -54,7 +53,7 @@ def change(name: str, old: str, new: str, k: int = 0) -> bytes:
 
 
 def change_pose(column: str, row: int, value: str) -> bytes:
-    names, *rows = [line.split(",") for line in seeds.pose_csv().decode().splitlines()]
+    names, *rows = [line.split(",") for line in pose().write_csv().splitlines()]
     rows[row][names.index(column)] = value
     return "\n".join(",".join(line) for line in [names, *rows]).encode()
 
@@ -120,7 +119,7 @@ def test_what_a_file_has_wrong_is_told(name: str, make: Callable[[], bytes], say
 
 
 def test_a_live_recording_that_is_damaged(tmp_path: Path) -> None:
-    good, live = seeds.live_log(), BY_NAME["live_log"]
+    good, live = live_log(), BY_NAME["live_log"]
     assert try_one(live, tmp_path, good) is None
     for old, new, says in (
         (b'"rate_hz": 100.0', b'"rate_hz": 1e300', "ticks at 1e+300 Hz"),
@@ -155,7 +154,7 @@ def test_a_device_without_end_is_no_file(suffix: str, tmp_path: Path, capsys: py
     named = tmp_path / f"a{suffix}"
     if suffix not in (".mcap", ".toml"):
         named = tmp_path / "session.toml"
-        named.write_text(seeds.SESSION.split("[sensors.left")[0].replace("arm.csv", f"a{suffix}"))
+        named.write_text(SESSION.replace("arm.csv", f"a{suffix}"))
     assert "a" + suffix in refused(["track", str(named), "-o", str(tmp_path / "out")], capsys)
 
 
