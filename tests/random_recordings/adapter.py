@@ -41,12 +41,7 @@ CAUSES = {
     "identical": set(),
     "swapped": {"sensors-exchanged"},
     "gap": {"samples-lost"},
-    "start": {
-        "start-pose-guessed",
-        "start-pose-motion",
-        "static-phase-trimmed",
-        "mount-contradicted",
-    },
+    "start": {"start-pose-guessed", "start-pose-motion", "static-phase-trimmed", "mount-contradicted"},
 }
 ALWAYS = ("start",)
 
@@ -91,7 +86,7 @@ class Result:
 # Session -----------------------------------------------------------------------------------------------------------
 
 
-def write_session(folder: Path, recorded: Recorded, layout: Layout, unit: str = "s", start_said: bool = True) -> Path:
+def write_session(folder: Path, recorded: Recorded, layout: Layout, unit: str = "s") -> Path:
     """The recording as a user has it: tables and the session file that names them."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = ['name = "random"', 'start_pose = "n_pose"', "[data]"]
@@ -100,7 +95,7 @@ def write_session(folder: Path, recorded: Recorded, layout: Layout, unit: str = 
         lines += [f'file = "recording{layout.suffix}"', _clock_line(recorded.tables[0])]
     lines += [f'gyro_unit = "{"deg/s" if layout.gyro_in_deg else "rad/s"}"']
     lines += [f'accel_unit = "{"g" if layout.accel_in_g else "m/s^2"}"', "[phases]"]
-    for name, span in (("start", recorded.start if start_said else None), ("clasp", recorded.clasp)):
+    for name, span in (("start", recorded.start), ("clasp", recorded.clasp)):
         if span is not None:
             lines.append(f"{name} = [[{span[0]:.6f}, {span[1]:.6f}]]")
     for k, table in enumerate(recorded.tables):
@@ -175,13 +170,7 @@ def calibrate(session: Path, out: Path, case: Case) -> list[str]:
     return ["calibrate", str(session), "-o", str(out), *options, *method, *_gaps(case.options)]
 
 
-def track(
-    session: Path,
-    out: Path,
-    method: str,
-    options: Iterable[str],
-    subject: Path | None = None,
-) -> list[str]:
+def track(session: Path, out: Path, method: str, options: Iterable[str], subject: Path | None = None) -> list[str]:
     options = set(options)
     argv = ["track", str(session), "-o", str(out), *_gaps(options)]
     argv += [] if method == "amekf" else ["--method", method]

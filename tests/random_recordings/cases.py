@@ -18,19 +18,7 @@ from .people import CORE, SIDES, Person, draw_person, sensor_place
 from .sensors import DEG, Worn, axes_rotation, draw_errors
 
 METHODS = {"amekf": 0.4, "smoother": 0.15, "smekf": 0.2, "ncf": 0.12, "gdc": 0.13}
-RATES = {
-    25.0: 1,
-    50.0: 2,
-    60.0: 2,
-    100.0: 6,
-    120.0: 1,
-    148.0: 1,
-    200.0: 2,
-    240.0: 0.7,
-    400.0: 0.7,
-    1000.0: 0.7,
-    2000.0: 0.4,
-}
+RATES = {25: 1, 50: 2, 60: 2, 100: 6, 120: 1, 148: 1, 200: 2, 240: 0.7, 400: 0.7, 1000: 0.7, 2000: 0.4}
 MOST_SAMPLES = 24_000  # of a recording
 
 
@@ -114,18 +102,14 @@ def stream(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def draw_case(seed: int, seconds: float | None = None, ordinary: bool = False) -> Case:
-    """The case of a seed: always the same. With `seconds`, one as long as that, at 25, 50, 100 Hz by turns,
-    of five sensors, wholly ordinary; `ordinary`: without what is out of the ordinary.
-    """
+def draw_case(seed: int) -> Case:
+    """The case of a seed: always the same."""
     person = draw_person(stream(seed, "person"))
     clock = _clock(stream(seed, "clock"))
     rng = stream(seed, "motion")
-    calibrates = rng.random() < 0.35 and seconds is None
-    if seconds is not None:
-        clock = Clock((25.0, 50.0, 100.0)[seed % 3], "even", clock.origin)
-    sensors = _segments(stream(seed, "segments"), calibrates) if seconds is None else CORE
-    activities, begins, joins, spans, duration, in_motion = _timeline(rng, person, clock.rate_hz, calibrates, seconds)
+    calibrates = rng.random() < 0.35
+    sensors = _segments(stream(seed, "segments"), calibrates)
+    activities, begins, joins, spans, duration, in_motion = _timeline(rng, person, clock.rate_hz, calibrates)
     sway, size = draw_sway(stream(seed, "sway"))
     bending = frozenset(side for side in SIDES if f"{side}_hand" in sensors)
     motion = Motion(person, activities, begins, joins, sway, draw_stance(stream(seed, "stance")), bending)
@@ -146,8 +130,7 @@ def draw_case(seed: int, seconds: float | None = None, ordinary: bool = False) -
         f"start pose stated {spans['start'][0]:.2f} to {spans['start'][1]:.2f} s",
     ]
     _commands(case, stream(seed, "commands"))
-    if seconds is None and not ordinary:
-        draw_oddities(case, stream(seed, "oddities"))
+    draw_oddities(case, stream(seed, "oddities"))
     case.about.append(f"by {case.method} {' '.join(sorted(case.options))}, then {', '.join(case.steps)}")
     return case
 
@@ -183,12 +166,11 @@ def _segments(rng: np.random.Generator, calibrates: bool) -> tuple[str, ...]:
 
 
 def _timeline(
-    rng: np.random.Generator, person: Person, rate_hz: float, calibrates: bool, seconds: float | None
+    rng: np.random.Generator, person: Person, rate_hz: float, calibrates: bool
 ) -> tuple[list[Activity], list[float], list[float], dict[str, tuple[float, float]], float, bool]:
     """Activities with begins and joins [s], the spans of the phases, the duration, whether it begins in motion."""
     most = MOST_SAMPLES / rate_hz
     total = min(most, float(np.exp(rng.uniform(np.log(20.0), np.log(120.0)))))
-    total = total if seconds is None else seconds
     held = float(np.exp(rng.uniform(np.log(0.6), np.log(10.0))))
     held = min(held, 0.4 * total)
     in_motion = bool(rng.random() < 0.25) and total > 20.0
@@ -249,38 +231,22 @@ def _worn(
 
 
 def _layout(rng: np.random.Generator) -> Layout:
-    return Layout(
-        str(rng.choice([".csv", ".parquet"])),
-        bool(rng.random() < 0.5),
-        bool(rng.random() < 0.4),
-        int(rng.choice([7, 9, 15])),
-    )
+    suffix, in_deg, in_g = str(rng.choice([".csv", ".parquet"])), rng.random() < 0.5, rng.random() < 0.4
+    return Layout(suffix, bool(in_deg), bool(in_g), int(rng.choice([7, 9, 15])))
 
 
 def _commands(case: Case, rng: np.random.Generator) -> None:
     """Method, options, and what follows `track`."""
     case.method = str(rng.choice(list(METHODS), p=list(METHODS.values())))
-    for option, share in (
-        ("covariance", 0.3),
-        ("report", 0.2),
-        ("causal", 0.12),
-        ("torques", 0.04),
-        ("no-limits", 0.04),
-    ):
+    options = {"covariance": 0.3, "report": 0.2, "causal": 0.12, "torques": 0.04, "no-limits": 0.04}
+    for option, share in options.items():
         if rng.random() < share and not (option == "causal" and case.method == "smoother"):
             case.options.add(option)
     whole = case.method == "smoother" or bool(case.options & {"causal", "torques"})  # not tracked in chunks
     steps = ["calibrate"] if case.clasp else []
     steps.append("track")
-    for step, share in (
-        ("evaluate", 0.3),
-        ("view", 0.15),
-        ("export", 0.5),
-        ("info", 0.15),
-        ("again", 0.1),
-        ("chunks", 0.3),
-        ("retarget", 0.03),
-    ):
+    after = {"evaluate": 0.3, "view": 0.15, "export": 0.5, "info": 0.15, "again": 0.1, "chunks": 0.3, "retarget": 0.03}
+    for step, share in after.items():
         if rng.random() < share and not (step == "chunks" and whole):
             steps.append(step)
     case.steps = steps

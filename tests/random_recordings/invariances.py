@@ -57,17 +57,6 @@ INVARIANCES: Mapping[str, Invariance] = {
 }
 
 
-@dataclass
-class Deviation:
-    """The largest difference [deg] of an invariance, and over what is stated."""
-
-    invariance: str
-    method: str
-    degrees: float
-    z: float
-    of: str
-
-
 def choose(case: Case) -> list[str]:
     """The invariance that is tried on this case, or none."""
     rng, fits = case.stream("invariance"), list_fitting(case)
@@ -94,43 +83,35 @@ def list_fitting(case: Case) -> list[str]:
     return fits
 
 
-def compare(case: Case, name: str, folder: Path) -> tuple[Deviation | None, list[Failure], list]:
-    """Track both and compare; what was found, failures, and how the commands ended."""
+def compare(case: Case, name: str, folder: Path) -> tuple[list[Failure], list]:
+    """Track both and compare; failures, and how the commands ended."""
     of = INVARIANCES[name]
     results, outcomes = [], []
     for which, variant in (("base", of.base), ("variant", of.variant)):
         recorded = record(case, variant)
-        layout = case.layout
-        if variant.other_units:
-            layout = type(layout)(layout.suffix, not layout.gyro_in_deg, not layout.accel_in_g, 15)
         # All digits: what is written shorter is another recording.
-        layout = type(layout)(layout.suffix, layout.gyro_in_deg, layout.accel_in_g, 15)
+        units = (unit != variant.other_units for unit in (case.layout.gyro_in_deg, case.layout.accel_in_g))
+        layout = type(case.layout)(case.layout.suffix, *units, 15)
         session = adapter.write_session(folder / which, recorded, layout)
         options = case.options - {"report"}
         outcome = adapter.run(adapter.track(session, folder / f"{which}-result", case.method, options))
         outcomes.append(outcome)
         if outcome.code:
             message = f"{which} of '{name}': exit {outcome.code}: {adapter.refusal(outcome)[-300:]}"
-            return None, [Failure("equal physics is accepted alike", " ".join(outcome.argv), message)], outcomes
+            return [Failure("equal physics is accepted alike", " ".join(outcome.argv), message)], outcomes
         results.append((adapter.read_result(folder / f"{which}-result"), recorded.origin))
-    (base, at), (other, other_at) = results
-    deviation, over = _deviation(case, name, (base, at), (other, other_at), of)
-    if over:
-        shown = " ".join(outcomes[-1].argv)
-        return deviation, [Failure(f"equal physics: {name}", shown, over)], outcomes
-    return deviation, [], outcomes
+    over = _find_difference(*results, of)
+    shown = " ".join(outcomes[-1].argv)
+    return [Failure(f"equal physics: {name}", shown, f"{over}, {case.method}")] if over else [], outcomes
 
 
-def _deviation(
-    case: Case, name: str, base: tuple[Result, float], other: tuple[Result, float], of: Invariance
-) -> tuple[Deviation, str]:
+def _find_difference(base: tuple[Result, float], other: tuple[Result, float], of: Invariance) -> str:
+    """The first segment that differs by more than it may, in words; empty: none does."""
     (one, at), (two, two_at) = base, other
     mirrored = of.variant.mirrored
-    largest = Deviation(name, case.method, 0.0, 0.0, "")
-    over = ""
     rows, rows_two = _common(one.time - at, two.time - two_at)
     if not len(rows):
-        return largest, "no common times"
+        return "no common times"
     for segment, quat in one.quat.items():
         quat_two = two.quat[other_side(segment) if mirrored else segment][rows_two]
         if mirrored:
@@ -142,20 +123,14 @@ def _deviation(
         if std is not None and of.most_deg is None:
             ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows], 1e-9))
             z = float(ratio.max())
-        if degrees > largest.degrees:
-            largest.degrees, largest.of = degrees, segment
-        largest.z = max(largest.z, z)
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
         if most is not None and std is None:
             most = max(most, of.unstated_deg)
         if of.most_deg is not None and std is not None:  # what is known to degrees may turn on a threshold by a tenth
             most = max(of.most_deg, THRESHOLD_SHARE * float(np.degrees(std[rows][k])))
         if (most is not None and degrees > most) or z > MOST_Z:
-            over = (
-                over
-                or f"{segment} is {degrees:.3g} deg off at {one.time[rows][k] - at:.1f} s, z = {z:.1f}, {case.method}"
-            )
-    return largest, over
+            return f"{segment} is {degrees:.3g} deg off at {one.time[rows][k] - at:.1f} s, z = {z:.1f}"
+    return ""
 
 
 def _common(one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ Each oracle gives failures: `Failure(oracle, command, message)`. None knows how 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
@@ -38,19 +38,6 @@ class Failure:
     oracle: str
     command: str
     message: str
-
-
-@dataclass
-class Accuracy:
-    """The largest z of a track, and where; `excuse`: the diagnostic that names its cause."""
-
-    z: float = 0.0
-    of: str = ""
-    at: float = 0.0
-    error: str = ""
-    excuse: str = ""
-    z_unexcused: float = 0.0
-    failures: list[Failure] = field(default_factory=list)
 
 
 def of_outcome(outcome: Outcome, out: object = None) -> list[Failure]:
@@ -109,14 +96,14 @@ def of_result(result: Result, shown: str) -> list[Failure]:
         off = float(np.max(np.abs(np.linalg.norm(quat, axis=1) - 1.0)))
         if off > UNIT:
             failures.append(Failure("unit quaternions", shown, f"{name}: norm is off 1 by {off:.3g}"))
-    for (one, other), length in _rigid(result).items():
-        if one in result.points and other in result.points:
-            apart = np.linalg.norm(result.points[one] - result.points[other], axis=1)
+    joints = ("shoulder", "elbow", "upper_arm"), ("elbow", "wrist", "forearm"), ("wrist", "palm", "hand")
+    for one, other, segment in [[f"{side}_{name}" for name in names] for side in SIDES for names in joints]:
+        if one in result.points and other in result.points:  # shoulders move on the torso: `_shoulders`
+            apart, length = np.linalg.norm(result.points[one] - result.points[other], axis=1), result.lengths[segment]
             off = float(np.max(np.abs(apart - length)))
             if off > RIGID:
-                failures.append(
-                    Failure("lengths hold", shown, f"{one} to {other}: {1e3 * off:.3g} mm off {length:.4f} m")
-                )
+                message = f"{one} to {other}: {1e3 * off:.3g} mm off {length:.4f} m"
+                failures.append(Failure("lengths hold", shown, message))
     for name, wanted in _shoulders(result).items():
         off = float(np.max(np.linalg.norm(result.points[name] - wanted, axis=1)))
         if off > RIGID:
@@ -125,16 +112,6 @@ def of_result(result: Result, shown: str) -> list[Failure]:
         if (std < 0.0).any():
             failures.append(Failure("± is a number", shown, f"{name}: {std.min():.3g}"))
     return failures
-
-
-def _rigid(result: Result) -> dict[tuple[str, str], float]:
-    of = result.lengths
-    pairs: dict[tuple[str, str], float] = {}  # shoulders move on the torso: `_shoulders`
-    for side in SIDES:
-        pairs[f"{side}_shoulder", f"{side}_elbow"] = of[f"{side}_upper_arm"]
-        pairs[f"{side}_elbow", f"{side}_wrist"] = of[f"{side}_forearm"]
-        pairs[f"{side}_wrist", f"{side}_palm"] = of[f"{side}_hand"]
-    return pairs
 
 
 def _shoulders(result: Result) -> dict[str, np.ndarray]:
@@ -162,10 +139,9 @@ def _shoulders(result: Result) -> dict[str, np.ndarray]:
     return wanted
 
 
-def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tuple[Accuracy, Truth]:
-    """Errors within six stated deviations, or a diagnostic that names the cause."""
+def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tuple[list[Failure], float, Truth]:
+    """Errors within six stated deviations, or a diagnostic that names the cause; the largest z that none names."""
     truth = truth_at(case, result.time, recorded.origin, result.start, result.calibrated)
-    accuracy = Accuracy()
     worst: list[tuple[float, str, int, str]] = []
     for name, quat in result.quat.items():
         error = (truth.R_WL[name].inv() * Rotation.from_quat(quat)).magnitude()
@@ -188,21 +164,12 @@ def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tup
         worst.append((float(z[k]), name, k, f"{1e3 * error[k]:.0f} mm at ± {1e3 * std[k]:.0f}"))
     causes = {*case.suspects.values(), *(["gap"] if case.clock.lost else [])}
     for z_, name, k, error_ in sorted(worst, reverse=True):
-        excuse = adapter.named_cause(result.diagnostics, _behind(name, case), causes) if z_ > MOST_Z else ""
-        if z_ > accuracy.z:
-            accuracy.z, accuracy.of, accuracy.at, accuracy.error, accuracy.excuse = (
-                z_,
-                name,
-                float(result.time[k]),
-                error_,
-                excuse,
-            )
-        if not excuse:
-            accuracy.z_unexcused = max(accuracy.z_unexcused, z_)
-        if z_ > MOST_Z and not excuse and not accuracy.failures:
-            message = f"{name} is {error_} at {result.time[k] - recorded.origin:.1f} s: z = {z_:.1f}"
-            accuracy.failures.append(Failure(f"error within {MOST_Z:g} ± or a warning", shown, message))
-    return accuracy, truth
+        if z_ > MOST_Z and adapter.named_cause(result.diagnostics, _behind(name, case), causes):
+            continue
+        message = f"{name} is {error_} at {result.time[k] - recorded.origin:.1f} s: z = {z_:.1f}"
+        failure = Failure(f"error within {MOST_Z:g} ± or a warning", shown, message)
+        return [failure] * (z_ > MOST_Z), z_, truth
+    return [], 0.0, truth
 
 
 def _z(over: np.ndarray, std: np.ndarray | None, fused: float | None, R: Rotation, quat: np.ndarray) -> np.ndarray:
@@ -231,11 +198,8 @@ def of_same_table(one: pl.DataFrame, other: pl.DataFrame, oracle: str, shown: st
     if one.equals(other):
         return []
     if one.columns != other.columns or one.height != other.height:
-        return [
-            Failure(oracle, shown, f"{one.shape} and {other.shape}, columns {set(one.columns) ^ set(other.columns)}")
-        ]
+        columns = set(one.columns) ^ set(other.columns)
+        return [Failure(oracle, shown, f"{one.shape} and {other.shape}, columns {columns}")]
     differ = [name for name in one.columns if not one[name].equals(other[name])]
-    size = max(
-        float(np.nanmax(np.abs(one[n].to_numpy().astype(float) - other[n].to_numpy().astype(float)))) for n in differ
-    )
+    size = max(np.nanmax(np.abs(np.subtract(one[n].to_numpy(), other[n].to_numpy(), dtype=float))) for n in differ)
     return [Failure(oracle, shown, f"{len(differ)} columns differ by up to {size:.3g}: {', '.join(differ[:4])}")]

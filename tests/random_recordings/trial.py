@@ -13,7 +13,7 @@ from . import adapter
 from .adapter import Outcome, Result
 from .cases import Case, draw_case
 from .invariances import choose, compare, list_fitting
-from .oracles import Accuracy, Failure, of_acceptance, of_errors, of_outcome, of_result, of_same_table
+from .oracles import Failure, of_acceptance, of_errors, of_outcome, of_result, of_same_table
 from .recordings import Recorded, record
 
 CLIPPED = 0.999  # share of the range from which a sensor is saturated
@@ -27,8 +27,8 @@ class Report:
     about: str
     failures: list[Failure] = field(default_factory=list)
     commands: list[tuple[str, int]] = field(default_factory=list)  # command, exit code
-    accuracy: dict[str, Any] = field(default_factory=dict)
-    deviations: list[dict[str, Any]] = field(default_factory=list)  # one for each invariance
+    method: str = ""  # of the filter, where a result was scored
+    z: float = 0.0  # its largest error over the stated one that no diagnostic explains
     recorded_s: float = 0.0
 
     def as_json(self) -> dict[str, Any]:
@@ -60,12 +60,10 @@ class Trial:
             if step in ("calibrate", "track", "info") or self.result is not None:
                 STEPS[step](self)
         for invariance in list_fitting(self.case) if invariances_alone else choose(self.case):
-            deviation, failures, outcomes = compare(self.case, invariance, self.folder / invariance)
+            failures, outcomes = compare(self.case, invariance, self.folder / invariance)
             self.report.failures += failures
             for outcome in outcomes:
                 self._count(outcome)
-            if deviation is not None:
-                self.report.deviations.append(asdict(deviation))
         return self.report
 
     def command(self, argv: list[str], out: Path | None = None, acceptance: str | None = None) -> Outcome:
@@ -118,9 +116,9 @@ class Trial:
             return
         if self.subject_failed or "swapped" in case.suspects.values():
             return
-        accuracy, truth = of_errors(self.result, case, self.recorded, shown)
-        self.report.failures += accuracy.failures
-        self.report.accuracy = _rounded(accuracy) | {"method": case.method}
+        failures, z, truth = of_errors(self.result, case, self.recorded, shown)
+        self.report.failures += failures
+        self.report.method, self.report.z = case.method, round(z, 3)
         worn = {name: R.as_quat() for name, R in truth.R_WL.items() if name in case.worn}
         adapter.write_truth(self.folder / "truth.parquet", self.result.time, worn, truth.points)
 
@@ -178,12 +176,6 @@ STEPS: dict[str, Callable[[Trial], None]] = {
     name: getattr(Trial, name)
     for name in ("calibrate", "track", "evaluate", "view", "export", "info", "again", "chunks", "retarget")
 }
-
-
-def _rounded(accuracy: Accuracy) -> dict[str, Any]:
-    values = asdict(accuracy)
-    del values["failures"]
-    return {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
 
 
 def try_seed(seed: int, keep: Path | None = None, invariances_alone: bool = False) -> Report:
