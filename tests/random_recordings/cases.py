@@ -102,8 +102,8 @@ def stream(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def draw_case(seed: int) -> Case:
-    """The case of a seed: always the same."""
+def draw_case(seed: int, ordinary: bool = False) -> Case:
+    """The case of a seed: always the same; `ordinary`: without what is out of the ordinary."""
     person = draw_person(stream(seed, "person"))
     clock = _clock(stream(seed, "clock"))
     rng = stream(seed, "motion")
@@ -130,7 +130,8 @@ def draw_case(seed: int) -> Case:
         f"start pose stated {spans['start'][0]:.2f} to {spans['start'][1]:.2f} s",
     ]
     _commands(case, stream(seed, "commands"))
-    draw_oddities(case, stream(seed, "oddities"))
+    if not ordinary:
+        draw_oddities(case, stream(seed, "oddities"))
     case.about.append(f"by {case.method} {' '.join(sorted(case.options))}, then {', '.join(case.steps)}")
     return case
 
