@@ -45,11 +45,10 @@ class Moment(NamedTuple):
 class QuickOptions(GuideOptions):
     """Estimates nothing on the way, and writes no page of a calibration."""
 
-    def estimate(self, recording: Recording) -> Calibration:  # noqa: ARG002
-        raise wp.BadSession("nothing is estimated here")
-
-    def calibrate(self, path: Path, entered: Mapping[str, float]) -> Calibration:
-        return calibrate(load_session(path), measured={**self.measured, **entered})
+    def calibrate(self, source: Recording | Path, entered: Mapping[str, float] | None = None) -> Calibration:
+        if isinstance(source, Recording):
+            raise wp.BadSession("nothing is estimated here")
+        return calibrate(load_session(source), measured={**self.measured, **(entered or {})})
 
 
 def make_guide(

@@ -1,9 +1,9 @@
 """The guided session: from sensors that send to a calibrated subject.
 
 `steps.make_steps` is the table of its steps. A step is a generator: it yields what to tell the person, gets the action
-that the person asks for, None where there is none, and returns the `Turn` that follows. Samples and ticks that came
-meanwhile, and the text that was typed, are in the guide's attributes. Steps can be repeated. Times are those of the
-source's clock.
+that the person asks for, None where there is none, and returns the name of the step that follows, "" for the next one.
+Ticks that came meanwhile, and the text that was typed, are in the guide's attributes. Steps can be repeated. Times are
+those of the source's clock.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,8 +33,11 @@ from ..readers import load_session
 from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
+from ..report.calibration import write_calibration_page
 from ..simulation import simulate
+from ..writers.calibration import write_calibration
 from ..writers.live_log import LiveLog
+from ..writers.provenance import collect_provenance, result_folder
 from .setup import AssignedSource, SensorSetup, write_segments
 from .sources.base import Source
 from .state import Action, GuideStep, GuideView, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
@@ -73,37 +77,24 @@ class GuideOptions:
         later = [load_protocol(part) for part in split_protocol(self.protocol)[1:]]
         return {step.phase for part in later for step in part.steps if step.phase != "start"}
 
-    @property
-    def stated(self) -> set[str]:
-        """Lengths that the person need not measure, `STATURE` among them where it is known."""
-        return {*self.measured, *([STATURE] if self.stature is not None or self.subject is not None else [])}
-
-    def estimate(self, recording: Recording, entered: Mapping[str, float] | None = None) -> Calibration:
-        """Calibrate a recording, with lengths [m] that the person has `entered`."""
-        lengths = {**self.measured, **(entered or {})}
-        return calibrate(
+    def calibrate(self, source: Recording | Path, entered: Mapping[str, float] = MappingProxyType({})) -> Calibration:
+        """Calibrate a recording, with lengths [m] that the person has `entered`; that of a file is saved beside it."""
+        recording = source if isinstance(source, Recording) else load_session(source)
+        measured, protocol = {**self.measured, **entered}, choose_parts(self.protocol, recording.phases)
+        calibration = calibrate(
             recording,
-            measured={name: value for name, value in lengths.items() if name != STATURE},
+            measured={name: value for name, value in measured.items() if name != STATURE},
             prior=None if self.subject is None else load_subject(self.subject),
-            stature=lengths.get(STATURE, self.stature),
+            stature=measured.get(STATURE, self.stature),
             sex=self.sex,
-            protocol=choose_parts(self.protocol, recording.phases),
+            protocol=protocol,
             method=self.method,
         )
-
-    def calibrate(self, path: Path, entered: Mapping[str, float]) -> Calibration:
-        """Calibrate the recording in a file as `estimate`, and save the result to a folder beside it."""
-        from ..report.calibration import write_calibration_page
-        from ..writers.calibration import write_calibration
-        from ..writers.provenance import collect_provenance, result_folder
-
-        recording, folder = load_session(path), path.with_suffix("")
-        calibration, measured = self.estimate(recording, entered), {**self.measured, **entered}
-        stated = {"session": path, "measured": measured, "prior": self.subject, "method": self.method}
-        stated["protocol"] = choose_parts(self.protocol, recording.phases)
-        with result_folder(folder, force=True) as partial:
-            write_calibration(partial, calibration, collect_provenance("calibrate", stated))
-        write_calibration_page(folder, calibration, recording, method=self.method)
+        if isinstance(source, Path):
+            stated = {"session": source, "measured": measured, "prior": self.subject, "method": self.method}
+            with result_folder(source.with_suffix(""), force=True) as folder:
+                write_calibration(folder, calibration, collect_provenance("calibrate", stated | {"protocol": protocol}))
+            write_calibration_page(source.with_suffix(""), calibration, recording, method=self.method)
         return calibration
 
 
@@ -119,24 +110,15 @@ def choose_parts(protocol: str, phases: Collection[str]) -> str:
     return "+".join(parts) or protocol
 
 
-class Turn(NamedTuple):
-    """How the guide goes on after a step."""
-
-    step: str = ""  # that follows; empty: the next one
-    again: bool = False  # it is repeated, though it was done before
-    reason: str = ""  # for which the person must repeat it
-    skipped: bool = False  # the step that ends was skipped
-
-
-StepRun = Generator[GuideView, Action | None, Turn]
+StepRun = Generator[GuideView, Action | None, str]
 
 
 class Step(NamedTuple):
-    """A step of the guide."""
+    """A step of the guide; `run` is told whether the step was asked for, and does not just follow the one before."""
 
     name: str
     title: str
-    run: Callable[[Guide, Turn], StepRun]
+    run: Callable[[Guide, bool], StepRun]
     before_attempt: bool = False  # sensors and their segments may still change: the recording begins after it
     records: bool = True  # the attempt goes on recording; else its samples wait for the next step
 
@@ -156,20 +138,19 @@ class Guide(Stage):
         super().__init__(source, outputs)
         self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor(source)
         self._figure, self._figure_due = Demonstration(options.model, options.joined) if outputs else None, 0.0
-        self.order = tuple(options.model.table.segments)  # segments in the order of the body
-        self.needs = options.joined.needs  # segments that must carry a sensor
         self.now, self.text = 0.0, ""  # [s] on the source's clock; what the person typed for the action
-        self.samples: Sequence[Samples] = ()  # that came since the step has last yielded
-        self.ticks: list[Ticks] = []  # those of the attempt
+        self.ticks: list[Ticks] = []  # of the attempt, that came since the step has last yielded
         self.segments: dict[str, str] = {}  # sensor → segment that it is assigned to
         self.attempt: Attempt | None = None  # the recording; None before it begins
         self.measured: dict[str, float] = {}  # lengths [m] that the person entered
+        self.reason = ""  # for which the person must begin again from the start pose
+        self.skipped = set[str]()  # steps
         self.accepted: Calibration | None = None
-        self._index, self._skipped = 0, set[str]()
         self._postponed: list[Samples] = []  # that came while an attempt is evaluated
+        self._index = 0
         self._view: GuideView
         self._running: StepRun
-        self._begin(Turn(self.steps[0].name))
+        self._begin(steps[0].name)
 
     @property
     def step(self) -> Step:
@@ -191,19 +172,18 @@ class Guide(Stage):
             self.loop(should_stop)
         finally:
             self.close()
-        if self.is_over:
+        if self.accepted is not None:
             self.send_status()
         return self.accepted
 
     def process(self, samples: list[Samples]) -> None:
-        self.now, self.samples, self.ticks = self.source.clock(), samples, []
+        self.now, self.ticks = self.source.clock(), []
         self.monitor.push(samples)
         if self.attempt is not None:
             self._postponed += samples
             if self.step.records:
                 postponed, self._postponed = self._postponed, []
                 self.ticks = self.attempt.push(postponed)
-                self.attempt.log.flush_if_due()
         self._go_on(None)
         now = time.monotonic()
         if self._figure is not None and now >= self._figure_due:
@@ -213,36 +193,32 @@ class Guide(Stage):
                 output.demonstrate(pose, self._figure.info)
 
     def do(self, action: Action, text: str) -> None:
-        self.samples, self.ticks, self.text = (), [], text
+        self.ticks, self.text = [], text
         if action in self._view.actions:
             self._go_on(action)
         else:
             self._running.close()
-            self._begin(Turn(action.name, again=True))
+            self._begin(action.name)
 
     def _go_on(self, action: Action | None) -> None:
         try:
             self._view = self._running.send(action)
         except StopIteration as ended:
-            if ended.value.skipped:
-                self._skipped.add(self.step.name)
             self._begin(ended.value)
 
-    def _begin(self, turn: Turn) -> None:
-        """Begin the step that follows; where sensors may change, a new attempt begins after it."""
-        names = [step.name for step in self.steps]
+    def _begin(self, name: str) -> None:
+        """Begin the step of this name, "": the next one; where sensors may change, a new attempt begins after it."""
         while True:
-            self._index = names.index(turn.step) if turn.step else self._index + 1
-            self._skipped.discard(self.step.name)
+            self._index = [step.name for step in self.steps].index(name) if name else self._index + 1
+            self.skipped.discard(self.step.name)
             if self.step.before_attempt:
                 self.close()
-            self.samples, self.ticks = (), []
-            self._running = self.step.run(self, turn)
+            self.ticks, self._running = [], self.step.run(self, bool(name))
             try:
                 self._view = next(self._running)
                 return
             except StopIteration as ended:  # there is nothing to do in it
-                turn = ended.value
+                name = ended.value
 
     def begin_attempt(self) -> Attempt:
         """Begin to record, unless a recording of these sensors runs."""
@@ -254,7 +230,7 @@ class Guide(Stage):
 
     def assign_source(self) -> AssignedSource:
         """The source with the sensors named by their segments."""
-        return AssignedSource(self.source, self.segments, self.order, is_open=True)
+        return AssignedSource(self.source, self.segments, self.options.model.table.segments, is_open=True)
 
     def accept(self, calibration: Calibration) -> None:
         """Save the subject of the attempt's calibration, and end."""
@@ -272,10 +248,11 @@ class Guide(Stage):
             self.attempt = None
 
     def view(self) -> GuideView:
-        steps = []
-        for k, step in enumerate(self.steps):
-            state = "ahead" if k > self._index else "now" if k == self._index else "done"
-            steps.append(GuideStep(step.name, step.title, "skipped" if step.name in self._skipped else state))
+        states = ["done"] * self._index + ["now"] + ["ahead"] * (len(self.steps) - self._index - 1)
+        steps = [
+            GuideStep(step.name, step.title, "skipped" if step.name in self.skipped else state)
+            for step, state in zip(self.steps, states, strict=True)
+        ]
         return self._view._replace(steps=tuple(steps))
 
     def build_status(self) -> Status:
@@ -329,6 +306,7 @@ class Attempt:
         """Record samples of the source; return the ticks that they complete."""
         ticks = [*self.stream.push(self._source.rename(samples))]
         self._ticks += ticks
+        self.log.flush_if_due()
         return ticks
 
     def mark(self, kind: str, **values: Any) -> None:

@@ -88,14 +88,6 @@ class GuideStep(NamedTuple):
     state: str  # "done", "skipped", "now", "ahead"
 
 
-class LengthEstimate(NamedTuple):
-    """A length as far as the motion so far determines it."""
-
-    name: str
-    metres: float
-    std: float  # [m]
-
-
 class GuideView(NamedTuple):
     """What the guide tells the person."""
 
@@ -108,8 +100,7 @@ class GuideView(NamedTuple):
     actions: tuple[Action, ...] = ()  # of this step; the first is the usual one
     highlight: str = ""  # segment to draw apart from the others
     demonstration: str = ""  # phase of the protocol to draw; empty: the start pose
-    lengths: tuple[LengthEstimate, ...] = ()
-    sample_size: tuple[float, float] | None = None  # effective sample size so far, and what is enough
+    lengths: Mapping[str, tuple[float, float]] = MappingProxyType({})  # name → value and standard deviation [m]
     quality: str = ""  # of the calibration: pass, poor, fail; empty before
     reasons: tuple[str, ...] = ()  # what to do more so far, or why it does not pass
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
@@ -15,16 +14,16 @@ import numpy as np
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
-from ..calibration.quality import ENOUGH_SAMPLES, format_longest
+from ..calibration.quality import format_longest
 from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
-from ..recording.arrivals import Samples, unpack_orientations
+from ..recording.arrivals import unpack_orientations
 from ..tracking.start_pose import StartPoseDetector
-from .guide import STATURE, Guide, GuideOptions, Step, StepRun, Turn
+from .guide import STATURE, Guide, GuideOptions, Step, StepRun
 from .loop import open_and_wait, warm_up
 from .setup import AssignedSource, SensorSetup
 from .sources.base import Source
-from .state import Action, GuideView, LengthEstimate, Output, join_names
+from .state import Action, GuideView, Output, join_names
 from .ticks import check_units
 
 SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
@@ -35,7 +34,6 @@ SHORTEST_STEP_S = 2e-3  # [s] between two orientations: of a tracker that does n
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
 GET_READY_S = 8.0  # [s] to leave the keyboard and take the pose
 MOST_LOSS_S = 2.0  # [s] of a silent sensor after which its heading has to be estimated anew
-SENTENCE_S = 9.0  # [s] for which each sentence of an instruction stands
 FIRST_ESTIMATE_S, ESTIMATE_PERIOD_S = 12.0, 4.0  # [s] of motion before the first estimate, and between two
 FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
 MORE_S = 30.0  # [s] of motion that "more" adds
@@ -45,9 +43,8 @@ LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromi
 # Codes of reasons that more motion takes away, or begin so.
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
-MEASURE_IT = "Measure what is asked for and enter it here."
 REMEDIES = {
-    "scale-uncertain": MEASURE_IT,
+    "scale-uncertain": "Measure what is asked for and enter it here.",
     "sensors-exchanged": "Exchange them here.",
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
@@ -99,114 +96,78 @@ def make_steps(protocol: Protocol) -> list[Step]:
 # Before the motion ---------------------------------------------------------------------------------------------------
 
 
-class ShakeDetector:
-    """Detects which sensor is shaken; after one was found, all must come to rest before the next."""
-
-    def __init__(self) -> None:
-        self.is_calm = False  # all have come to rest since the last shake: the next one counts
-        self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
-        self._last: dict[str, tuple[float, np.ndarray]] = {}  # sensor → time [s] and (4,) of its last orientation
-
-    def push(self, samples: Iterable[Samples], measured: Collection[str] = ()) -> None:
-        """Add samples of any sensors; those of `measured` are orientations."""
-        for chunk in samples:
-            squares = np.sum(chunk.gyro_S**2, axis=1)
-            if chunk.sensor in measured:  # from each orientation to the next
-                quat = unpack_orientations(chunk.gyro_S, chunk.accel_S)
-                last_time, last_quat = self._last.get(chunk.sensor, (chunk.time[0], quat[0]))
-                self._last[chunk.sensor] = float(chunk.time[-1]), quat[-1]
-                cosine = np.abs(np.sum(np.concatenate([last_quat[None], quat[:-1]]) * quat, axis=1))
-                step_s = np.maximum(np.diff(chunk.time, prepend=last_time), SHORTEST_STEP_S)
-                squares = (2.0 * np.arccos(np.minimum(cosine, 1.0)) / step_s) ** 2
-            recent = self._recent.setdefault(chunk.sensor, deque())
-            recent.extend(zip(chunk.time.tolist(), squares.tolist(), strict=True))
-            while recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
-                recent.popleft()
-
-    def find(self, candidates: Sequence[str]) -> str | None:
-        """The candidate that is shaken; None: none, several, or those of the last shake still move."""
-        rates = self._find_rates()
-        if not self.is_calm:
-            self.is_calm = max(rates.values(), default=0.0) < CALM_RATE
-            return None
-        *_, second, first = sorted(["", "", *candidates], key=lambda sensor: rates.get(sensor, 0.0))
-        if rates.get(first, 0.0) < max(SHAKE_RATE, SHAKE_RATIO * rates.get(second, 0.0)):
-            return None
-        self.is_calm = False
-        return first
-
-    def list_moving(self) -> list[str]:
-        return [sensor for sensor, rate in self._find_rates().items() if rate > CALM_RATE]
-
-    def _find_rates(self) -> dict[str, float]:
-        """Sensor → rms rate [rad/s] of those that were seen for as long as a shake takes."""
-        return {
-            sensor: float(np.sqrt(np.mean([square for _, square in recent])))
-            for sensor, recent in self._recent.items()
-            if recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
-        }
-
-
-def find_sensors(guide: Guide, _: Turn) -> StepRun:
-    needed = len(guide.needs)
+def find_sensors(guide: Guide, _: bool) -> StepRun:
+    needed = len(guide.options.joined.needs)
     while True:
-        sending = guide.monitor.sending
-        count = len(sending) - len(guide.silent)
-        awaited = guide.source.describe_awaited()
+        count, awaited = len(guide.monitor.sending) - len(guide.silent), guide.source.describe_awaited()
         sentence = f"Strap the sensors on and switch them on: {count} of {needed} send."
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
         elif awaited:
             sentence += f" Waiting for {awaited}."
-        actions = (CONTINUE,) if count >= needed else ()
-        progress = min(1.0, count / max(needed, 1))
-        if (yield GuideView(sentence, guide.describe_problems(), progress=progress, actions=actions)) is CONTINUE:
-            return Turn()
+        actions, progress = (CONTINUE,)[: count >= needed], min(1.0, count / max(needed, 1))
+        if (yield GuideView(sentence, guide.describe_problems(), progress=progress, actions=actions)):
+            return ""
 
 
-def assign_segments(guide: Guide, turn: Turn) -> StepRun:
+def assign_segments(guide: Guide, asked_for: bool) -> StepRun:
     """Find by shaking which sensor sits on which segment; the ends of limbs first: the forearm moves with the arm."""
-    if not turn.again:
-        known = {name: name for name in guide.order} | dict(guide.options.known) | guide.segments
+    needs, chains = guide.options.joined.needs, guide.options.model.chains
+    order = sorted(needs, key=lambda name: chains[name].joints[-1:], reverse=True)
+    if not asked_for:
+        known = {name: name for name in guide.options.model.table.segments} | dict(guide.options.known) | guide.segments
         known = {name: known[name] for name in guide.monitor.sending if name in known}
-        if set(guide.needs) <= set(known.values()):
+        if set(order) <= set(known.values()):
             guide.segments = known
-            return Turn()
-    parents = guide.options.model.parents
-
-    def count_above(segment: str | None) -> int:
-        return 0 if segment is None else 1 + count_above(parents.get(segment))
-
-    order = sorted(guide.needs, key=count_above, reverse=True)
-    guide.segments, shakes = {}, ShakeDetector()
-    while True:
-        shakes.push(guide.samples, guide.source.orientations)
+            return ""
+    guide.segments, is_calm = {}, False  # all have come to rest since the last shake: the next one counts
+    while len(guide.segments) < len(order):
+        rates = measure_shakes(guide)
         free = [name for name in guide.monitor.sending if name not in guide.segments]
-        segments = [name for name in order if name not in guide.segments.values()]
-        shaken = free[0] if len(free) == len(segments) == 1 else shakes.find(free)
-        if shaken is not None:
-            guide.segments[shaken] = segments.pop(0)
-        if not segments:
-            return Turn()
+        segment, *others = (name for name in order if name not in guide.segments.values())
+        *_, second, first = sorted(["", "", *free], key=lambda sensor: rates.get(sensor, 0.0))
+        is_shaken = is_calm and rates.get(first, 0.0) >= max(SHAKE_RATE, SHAKE_RATIO * rates.get(second, 0.0))
+        is_calm = (is_calm or max(rates.values(), default=0.0) < CALM_RATE) and not is_shaken
+        if is_shaken or (len(free) == 1 and not others):
+            guide.segments[first] = segment
+            continue
         note = ""
-        if moving := join_names(shakes.list_moving()):
+        if moving := join_names([sensor for sensor, rate in rates.items() if rate > CALM_RATE]):
             note = f"Too gentle, or not alone: {moving}. Shake one harder, hold the others still."
-            if not shakes.is_calm:
+            if not is_calm:
                 note = f"Hold all sensors still for a moment. Moving: {moving}."
         asked = yield GuideView(
-            f"Shake the sensor on the {join_names(segments[:1])}.",
+            f"Shake the sensor on the {join_names([segment])}.",
             guide.describe_problems() or note,
-            progress=len(guide.segments) / len(guide.needs),
-            highlight=segments[0],
+            progress=len(guide.segments) / len(order),
+            highlight=segment,
             actions=(ANEW,) if guide.segments else (),
         )
         if asked is ANEW:
-            guide.segments, shakes = {}, ShakeDetector()
+            guide.segments, is_calm = {}, False
+    return ""
 
 
-def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
+def measure_shakes(guide: Guide) -> dict[str, float]:
+    """Measure each sensor's rms rate [rad/s] over its newest `SHAKE_WINDOW_S`, where it has sent for so long."""
+    rates = {}
+    for sensor in guide.monitor.sending:
+        _, time_s, gyro_S, accel_S = guide.monitor.collect(sensor, SHAKE_WINDOW_S)
+        if np.ptp(time_s) < 0.75 * SHAKE_WINDOW_S:
+            continue
+        rate = np.linalg.norm(gyro_S, axis=1)
+        if sensor in guide.source.orientations:  # from each orientation to the next
+            quat = unpack_orientations(gyro_S, accel_S)
+            cosine = np.minimum(np.abs(np.sum(quat[1:] * quat[:-1], axis=1)), 1.0)
+            rate = 2.0 * np.arccos(cosine) / np.maximum(np.diff(time_s), SHORTEST_STEP_S)
+        rates[sensor] = float(np.sqrt(np.mean(rate**2)))
+    return rates
+
+
+def hold_start_pose(guide: Guide, _: bool) -> StepRun:
     """Wait until the person is ready, then until the start pose was held in right units; the motions begin anew."""
-    attempt, reason, protocol = guide.begin_attempt(), turn.reason, guide.options.joined
+    attempt, protocol = guide.begin_attempt(), guide.options.joined
+    reason, guide.reason = guide.reason, ""
     starts = [(step.seconds, step.do) for step in protocol.steps if step.phase == "start"]
     seconds, do = starts[0] if starts else (START_POSE_S, "Stand still in the start pose.")
     while True:
@@ -234,7 +195,7 @@ def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
                         break
                     attempt.mark("begin", phase="start", time=first)
                     attempt.mark("end", phase="start", time=last)
-                    return Turn()
+                    return ""
             countdown = begin - guide.now if guide.now < begin else (1.0 - progress) * seconds
             note = guide.describe_problems() or moved
             asked = yield GuideView(do, reason or note, countdown, progress=progress, actions=(AGAIN,))
@@ -243,58 +204,52 @@ def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
 # The motion ----------------------------------------------------------------------------------------------------------
 
 
-def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
+def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepRun:
     """Record a phase of the protocol; the person sees what it has determined. A lost sensor needs the start pose."""
     attempt, phase, target_s = guide.begin_attempt(), motion.phase, motion.seconds
-    if turn.again:
+    if asked_for:
         target_s = max(target_s, attempt.measured_s(phase) + min(MORE_S, target_s))
     begin, running = guide.now + GET_READY_S, False
     estimate: Calibration | None = None  # of the motion so far
     future: Future[Calibration] | None = None  # the next one
-    estimated_s, optional = 0.0, guide.options.optional
+    estimated_s, others = 0.0, (FINISH, RESTART, SKIP) if phase in guide.options.optional else (FINISH, RESTART)
     try:
         while (done_s := attempt.measured_s(phase)) < target_s:
             if guide.monitor.list_silent(guide.segments, guide.now, MOST_LOSS_S):
-                return Turn("start", reason=f"{guide.describe_problems()} Headings were lost: begin once more.")
+                guide.reason = f"{guide.describe_problems()} Headings were lost: begin once more."
+                return "start"
             if not running and guide.now >= begin:
                 attempt.mark("begin", phase=phase, time=attempt.newest)
                 running = True
             if future is None and done_s >= max(FIRST_ESTIMATE_S, estimated_s + ESTIMATE_PERIOD_S):
-                estimated_s, future = done_s, calculate(partial(guide.options.estimate, attempt.recording()))
+                estimated_s, future = done_s, calculate(partial(guide.options.calibrate, attempt.recording()))
             elif future is not None and future.done():
                 with suppress(WeposeError):
                     estimate = future.result()
                 future = None
-            finish = [FINISH] * (done_s > min(FINISH_AFTER_S, motion.seconds))
             view = GuideView(
-                _choose_sentence(motion, done_s),
+                motion.do,
                 guide.describe_problems() if guide.silent else "",
                 None if running else max(0.0, begin - guide.now),
                 max(0.0, target_s - done_s),
                 done_s / target_s,
-                actions=(*finish, RESTART, *[SKIP] * (phase in optional)),
+                actions=others[done_s <= min(FINISH_AFTER_S, motion.seconds) :],
                 demonstration=phase,
             )
-            asked = yield view if estimate is None else _add_estimate(view, estimate, running, motion)
+            asked = yield view if estimate is None else _add_estimate(view, estimate, running)
             if asked is FINISH:
-                return Turn()
+                return ""
             if asked is RESTART:
-                return Turn("start")
+                return "start"
             if asked is SKIP:
                 attempt.mark("discard", phase=phase)
                 running = False
-                return Turn(skipped=True)
-        return Turn()
+                guide.skipped.add(phase)
+                return ""
+        return ""
     finally:
         if running:
             attempt.mark("end", phase=phase, time=attempt.newest)
-
-
-def _choose_sentence(motion: ProtocolStep, done_s: float) -> str:
-    """First the first sentence of the instruction, then the others in turn."""
-    sentences = [f"{part.strip().rstrip('.')}." for part in motion.do.replace("\n", " ").split(". ")]
-    further, turn = sentences[1:] or sentences, int(done_s / SENTENCE_S)
-    return sentences[0] if turn == 0 else further[(turn - 1) % len(further)]
 
 
 def calculate(compute: Callable[[], Calibration]) -> Future[Calibration]:
@@ -311,15 +266,15 @@ def calculate(compute: Callable[[], Calibration]) -> Future[Calibration]:
     return future
 
 
-def _add_estimate(view: GuideView, calibration: Calibration, running: bool, motion: ProtocolStep) -> GuideView:
+def _add_estimate(view: GuideView, calibration: Calibration, running: bool) -> GuideView:
     """The view with what the motion has determined so far, and what to do while the person moves."""
-    view = _add_lengths(view, calibration)
+    view = view._replace(lengths=_list_lengths(calibration))
     if calibration.exchanged:
         note = view.note or "Some sensors seem to sit on other segments than assigned: finish, and see."
         return view._replace(note=note)
     newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
     if running and np.isfinite(newest).any() and np.nanmedian(newest) > APART:
-        view = view._replace(note=f"{_choose_sentence(motion, 0.0)} They seem to be apart.")
+        view = view._replace(note="They seem to be apart.")
     elif running and calibration.quality.quality == "pass":
         view = view._replace(sentence="This is enough: finish, or go on for smaller uncertainties.")
     # About the parts of the motion that are too small, else the worst reason.
@@ -329,16 +284,14 @@ def _add_estimate(view: GuideView, calibration: Calibration, running: bool, moti
     return view._replace(reasons=tuple(advice)[:MOST_ADVICE])
 
 
-def _add_lengths(view: GuideView, calibration: Calibration) -> GuideView:
-    subject = calibration.subject
-    lengths = tuple(LengthEstimate(name, metres, subject.std(name)) for name, metres in subject.lengths.items())
-    return view._replace(lengths=lengths, sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES))
+def _list_lengths(calibration: Calibration) -> dict[str, tuple[float, float]]:
+    return {name: (metres, calibration.subject.std(name)) for name, metres in calibration.subject.lengths.items()}
 
 
 # The result ----------------------------------------------------------------------------------------------------------
 
 
-def show_result(guide: Guide, _: Turn) -> StepRun:
+def show_result(guide: Guide, _: bool) -> StepRun:
     attempt, options = guide.begin_attempt(), guide.options
     attempt.log.flush()
     entered = note = ""  # a length that was entered, and why it cannot be
@@ -347,7 +300,7 @@ def show_result(guide: Guide, _: Turn) -> StepRun:
         while not future.done():
             view = GuideView("The motion is being evaluated. You may move freely.", note, actions=(RESTART,))
             if (yield view) is RESTART:
-                return Turn("start")
+                return "start"
         calibration, reason = None, ""
         try:
             calibration = future.result()
@@ -364,14 +317,14 @@ def show_result(guide: Guide, _: Turn) -> StepRun:
                 guide.accept(calibration)
             elif asked is MORE:
                 motions = [step for step in options.joined.steps if step.phase != "start"]
-                return Turn(max(motions, key=lambda step: step.seconds).phase, again=True)
+                return max(motions, key=lambda step: step.seconds).phase
             elif asked is RESTART:
-                return Turn("start")
+                return "start"
             elif asked is EXCHANGE and calibration is not None:
                 moved = {label: segment for segment, label in calibration.exchanged.items()}
                 attempt.mark("assign", segments={name: moved.get(own, own) for name, own in attempt.segments.items()})
                 guide.segments = {name: moved.get(own, own) for name, own in guide.segments.items()}
-                return Turn("quality")
+                return "quality"
             elif asked is not None and asked.name == MEASURE.name:
                 try:
                     guide.measured[length] = 0.01 * float(guide.text.replace(",", "."))
@@ -386,14 +339,13 @@ def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> t
     if calibration is None:
         sentence = "This motion cannot be evaluated."
         return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(error,)), ""
-    quality = calibration.quality
-    codes, lengths_given = [reason.code for reason in quality.reasons], calibration.problem.scale_lengths
+    quality, options = calibration.quality, guide.options
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
     begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
     open_s = format_longest([(first - begin, last - begin) for first, last in calibration.open_intervals])
     counted = [replace(d, facts={**d.facts, "intervals": open_s}) if "intervals" in d.facts else d for d in diagnostics]
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
-    actions = [ACCEPT, MORE, RESTART]
+    codes, actions = [reason.code for reason in quality.reasons], [ACCEPT, MORE, RESTART]
     if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned. The same motion will do."
         reasons, actions = reasons[:1], [EXCHANGE, RESTART]
@@ -406,12 +358,14 @@ def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> t
     else:
         sentence, actions = "This calibration must not be used.", [RESTART, MORE]
     length = ""
-    if any(REMEDIES.get(code) == MEASURE_IT for code in codes):
+    if "scale-uncertain" in codes:
         best = calibration.problem.measured_example.partition("=")[0]
-        choices = (STATURE, best) if lengths_given else (best, STATURE)
-        length = next((name for name in choices if name not in {*guide.options.stated, *guide.measured}), "")
+        known = {*options.measured, *guide.measured}
+        known |= {STATURE} if options.stature is not None or options.subject is not None else set()
+        choices = (STATURE, best) if calibration.problem.scale_lengths else (best, STATURE)
+        length = next((name for name in choices if name not in known), "")
     if length:
         name = LENGTH_NAMES.get(length, length.replace("_", " "))
         actions.append(MEASURE._replace(entry=f"{name} [cm]"))
     view = GuideView(sentence, progress=1.0, actions=tuple(actions), quality=quality.quality, reasons=tuple(reasons))
-    return _add_lengths(view, calibration), length
+    return view._replace(lengths=_list_lengths(calibration)), length

@@ -177,12 +177,13 @@ function showGuide(guide) {
 }
 const QUALITY = { "": "So far", pass: "✓ Good", poor: "! Usable", fail: "✕ Not usable" };
 function showResult(guide) {
-  $("result").hidden = !guide.lengths.length && !guide.reasons.length;
+  const lengths = Object.entries(guide.lengths);
+  $("result").hidden = !lengths.length && !guide.reasons.length;
   $("quality").textContent = QUALITY[guide.quality];
   $("quality").className = guide.quality;
   $("reasons").replaceChildren();
   guide.reasons.forEach((reason) => text($("reasons"), "p", reason));
-  $("lengths").querySelector("tbody").replaceChildren(...guide.lengths.map(({ name, metres, std }) => {
+  $("lengths").querySelector("tbody").replaceChildren(...lengths.map(([name, [metres, std]]) => {
     const row = document.createElement("tr"), mm = (value, digits) => known(value === null ? null : 1e3 * value, digits);
     text(row, "td", words(name));
     text(row, "td", `${mm(metres, 0)} mm`);
@@ -191,8 +192,6 @@ function showResult(guide) {
     bar.style.width = `${Math.min(100, 2500 * std)}%`;
     return row;
   }));
-  $("sample-size").textContent = guide.sample_size === null ? ""
-    : `Effective sample size ${known(guide.sample_size[0], 1)}; ${known(guide.sample_size[1], 0)} are enough.`;
 }
 let state = "";
 function show(status) {
