@@ -69,11 +69,11 @@ def run_guide(
 
     Returns the source and the setup to track with. The source, not open before, stays open then, the outputs always.
     """
-    steps = make_steps(options.joined)
+    options.joined.check_body(options.model.table)
     threading.Thread(target=warm_up, args=(options.method,), daemon=True).start()  # tracking begins without a wait
     if not open_and_wait(source, outputs, should_stop):
         return None
-    guide = Guide(source, options, steps, outputs)
+    guide = Guide(source, options, make_steps(options.joined), outputs)
     if guide.run(should_stop) is None:
         source.close()
         return None
