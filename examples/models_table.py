@@ -16,10 +16,9 @@ from wepose_pin.body.configuration import compute_orientation_residuals, solve_c
 N = 200  # random poses: every segment up to 60 deg from the one above
 for path in sys.argv[1:] or [None]:
     body = wp.load_model(path)
-    chain_of = body.chains
     rng = np.random.default_rng(0)
     quat_WL = {}
-    for segment in chain_of:
+    for segment in body.chains:
         above = body.parents[segment]
         R = Rotation.from_rotvec(np.radians(60.0) * rng.uniform(-0.57, 0.57, (N, 3)))
         R_WA = Rotation.from_quat(quat_WL[above]) if above in quat_WL else Rotation.identity()
@@ -31,7 +30,7 @@ for path in sys.argv[1:] or [None]:
     print(f"  {body.pin.nv} degrees of freedom: {len(body.joints)} spherical joints, {len(singles)} of one axis")
     print(f"  mass {sum(inertia.mass for inertia in body.pin.inertias):.2f} kg")
     print("  lengths [m]  " + "  ".join(f"{name} {length:.3f}" for name, length in body.lengths.items()))
-    for segment, chain in chain_of.items():
-        joints = ", ".join(body.pin.names[joint] for joint in chain.joints) or "none: rigid with what it hangs on"
+    for segment, chain in body.chains.items():
+        joints = ", ".join(body.pin.names[joint] for joint in chain) or "none: rigid with what it hangs on"
         rms = np.degrees(np.sqrt(np.mean(residuals[segment] ** 2))) if segment in residuals else 0.0
         print(f"  {segment:16s} residual {rms:4.1f} deg (rms)   joints: {joints}")

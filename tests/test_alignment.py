@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin import OrientationSensor, Recording, Simulation, Subject, WeposeError, population_subject
-from wepose_pin.body.subject import StartPoseOffset
 from wepose_pin.recording import compute_mount, find_mount_axes
 
 
@@ -108,7 +107,7 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
 def test_a_person_stands_as_in_the_calibration() -> None:
     """Leaning by 20 deg in both start poses is no mount that moved; by 20 deg in one of them is."""
     lean = np.array([0.0, np.deg2rad(20.0)])
-    start = StartPoseOffset(lean, np.deg2rad(1.0))
+    start = np.deg2rad([0.0, 20.0, 1.0])
     subject = replace(mounted("torso", np.deg2rad(1.0) ** 2 * np.eye(3)), start_pose_offset={"torso": start})
     for tilt, off in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], [9.0]), (0.0 * lean, [20.0])):
         recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * MOUNT})

@@ -14,7 +14,7 @@ from commands import run
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import load_model, population_subject, simulate, simulate_person, track
-from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.configuration import compute_pose
 from wepose_pin.body.links import compute_point_covariances
 from wepose_pin.writers import write_session
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin import BadData, ExistingOutput, Pose, export, load_model
-from wepose_pin.body.kinematics import build_pose_table, compute_pose
+from wepose_pin.body.configuration import compute_pose
+from wepose_pin.body.kinematics import build_pose_table
 
 LENGTHS = {"shoulder_width": 0.41, "left_upper_arm": 0.29, "right_forearm": 0.25, "right_hand": 0.07}
 POINTS = [f"{side}_{part}" for side in ("left", "right") for part in ("shoulder", "elbow", "wrist", "palm")]

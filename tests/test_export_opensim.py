@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 
 from wepose_pin import Pose, export, joint_angles, load_model
-from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.configuration import compute_pose
 
 SEGMENT_OF = {
     "pelvis": "pelvis",

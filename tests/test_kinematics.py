@@ -11,8 +11,7 @@ from bodies import POINTS, RIGID_SHOULDERS, measure_residuals
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import BodyModel, load_model
-from wepose_pin.body.configuration import solve_configuration
-from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.configuration import compute_pose, solve_configuration
 from wepose_pin.body.links import compute_link_poses
 
 CORE = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]

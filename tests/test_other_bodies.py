@@ -28,7 +28,7 @@ from wepose_pin import (
     load_result,
     track,
 )
-from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.configuration import compute_pose
 
 THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
 SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")
@@ -71,8 +71,6 @@ left_hip = "right_hip"
 left_knee = "right_knee"
 left_ankle = "right_ankle"
 left_toe = "right_toe"
-[sensors]
-left_thigh = { place = "outside, above the knee" }
 [draw]
 limbs = [
     ["right_hip", "left_hip"],

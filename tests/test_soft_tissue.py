@@ -15,7 +15,8 @@ from wepose_pin.simulation import simulate_person
 def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
     hinge = Hinge(np.array((0.0, 1.0, 0.0)), 0.05, shown)
     subject = replace(population_subject(), hinges={"right_elbow": hinge})
-    assert subject.shape(load_model()).tissue_means["right_upper_arm"].lag == pytest.approx(used)
+    personal = subject.shape(load_model()).personal["right_upper_arm"]
+    assert personal.soft_tissue.mean_per_twist == pytest.approx(used)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])
@@ -27,7 +28,9 @@ def test_a_hinge_shows_how_far_skin_lags_behind_a_twist(size: float) -> None:
     subject = calibrate(recording, measured=person.measured, prior=person.prior).subject
     tracked = track(recording, subject)
     uncorrected = track(recording, replace(subject, hinges={}))
-    assert tracked.model.tissue_means["torso"].share == pytest.approx(size, abs=0.5)
+    table, personal = tracked.model.table, tracked.model.personal_table
+    usual, own = (each.segments["torso"].soft_tissue.mean_per_tilt[1] for each in (table, personal))
+    assert own / usual == pytest.approx(size, abs=0.5)
     errors = []
     for pose in (tracked, uncorrected):
         relative, true = (

@@ -184,13 +184,13 @@ class Key:
     mappings of names to any of them, each a table. In place of a NamedTuple's table its first field alone may stand.
     """
 
-    name: str = ""  # empty: that of the field and the unit, ``softness_deg``
+    name: str = ""  # empty: that of the field, and the unit of a number, ``softness_deg``
     unit: str = ""  # of the file's numbers; of deg, deg_min and mm the field is in rad, rad/s and m
     least: float = -1e6  # limits of each number, in the file's unit
     most: float = 1e6
     of: str = ""  # what texts name; `read_record` is given the names that there are
     words: Mapping[str, Any] = field(default_factory=dict, hash=False)  # text in the file → value of the field
-    each: tuple[str, ...] = ()  # the keys of an array's numbers
+    each: tuple[str, ...] = ()  # the keys of an array's numbers; one that begins with "std" is at least 0
     unread: tuple[str, ...] = ()  # keys beside those, for whoever looks at the file
     digits: int | None = None  # decimals that are written; None: all that count
 
@@ -209,7 +209,8 @@ def _find_keys(kind: Callable[..., Any]) -> dict[str, tuple[Any, Key]]:
             continue
         key = next((note for note in notes if isinstance(note, Key)), Key())
         value_type = get_args(value_type)[0] if isinstance(value_type, UnionType) else value_type
-        keys[name] = value_type, replace(key, name=key.name or "_".join(filter(None, (name, key.unit))))
+        unit = "" if key.each else key.unit
+        keys[name] = value_type, replace(key, name=key.name or "_".join(filter(None, (name, unit))))
     return keys
 
 
@@ -255,7 +256,9 @@ def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Colle
             values[name] = _read_value(parts[1], own, replace(key, name=name), known, values.get(name))
         return values
     if key.each:
-        return np.array([_read_value(float, table, replace(key, name=part, each=()), {}, None) for part in key.each])
+        least = {part: 0.0 if part.startswith("std") else key.least for part in key.each}
+        keys = (replace(key, name=part, each=(), least=least[part]) for part in key.each)
+        return np.array([_read_value(float, table, each, {}, None) for each in keys])
     names: Collection[str] = known[key.of] if key.of else key.words
     hint = str if key.words else Annotated[hint, key.limits] if float in (hint, *parts) else hint
     if value is None:

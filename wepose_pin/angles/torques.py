@@ -111,7 +111,7 @@ def pose_torques(tracked: TrackResult, cutoff_hz: float = CUTOFF_HZ) -> Torques:
     Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.
     """
     model = tracked.model
-    moved = {joint for name, chain in model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
+    moved = {joint for name, chain in model.chains.items() if name in tracked.quat_WL for joint in chain}
     joints = None if model.table.is_mechanism else moved
     return joint_torques(model.pin, tracked.time, tracked.q, cutoff_hz, joints)
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -20,30 +20,12 @@ from . import lengths as _lengths
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
 from .lengths import measure_reaches
-from .soft_tissue import TissueMean
 from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, read_table
 from .tree import MOST_LINKS, Tree, build, check_joint_values, parse_tree, rename_links
 from .urdf import Visual, import_yourdfpy, list_visuals, read_urdf
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
 FAR_OFF = 5.0
-
-
-class Chain(NamedTuple):
-    """The joints that set a segment's orientation, by Pinocchio's numbers, from the root outwards.
-
-    A segment of a limb is set by the joints nearest to it, as many as make three axes; others above (a clavicle) rest.
-    A segment of the spine is set by all joints between it and the segment above.
-    """
-
-    joints: tuple[int, ...]  # empty where the segment is rigid with the one above
-    spherical: int | None  # the one nearest to the segment, which takes what the others leave; None: there is none
-    above: str | None  # the segment above; of segments on one joint the later ones are on the first; None: the root
-
-    @property
-    def exact(self) -> bool:
-        """Whether every orientation can be followed."""
-        return self.spherical is not None
 
 
 @dataclass(frozen=True)
@@ -59,7 +41,8 @@ class BodyModel:
     axes : the same → (3, 3) the axes that were joined, a row each, in the joint's frame at zero; without an entry for
         a `floating` joint
     girdles : girdle → (7,) what a person differs by from its law, `girdle.PARAMETERS`; zeros where it is not named
-    tissue_means : segment → what a person's has turned beyond its sensor; nothing where it is not named
+    personal : segment → its properties with a person's own means of soft tissue and start pose, which are corrected;
+        a segment that is not named is as of all people
     """
 
     pin: pin.Model
@@ -68,7 +51,7 @@ class BodyModel:
     joints: Mapping[str, int]
     axes: Mapping[str, np.ndarray]
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
-    tissue_means: Mapping[str, TissueMean] = field(default_factory=dict)
+    personal: Mapping[str, Segment] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"BodyModel({self.robot.name!r}: {len(self.table.segments)} segments, {self.pin.nv} degrees of freedom)"
@@ -76,6 +59,11 @@ class BodyModel:
     def girdle_parameters(self, name: str) -> np.ndarray:
         """(7,) what a girdle differs by from its law."""
         return self.girdles.get(name, np.zeros(len(PARAMETERS)))
+
+    @cached_property
+    def personal_table(self) -> BodyTable:
+        """The table with the properties of a person's segments: their standard deviations remain beyond the means."""
+        return replace(self.table, segments={**self.table.segments, **self.personal})
 
     @cached_property
     def point_girdles(self) -> dict[str, tuple[str, ...]]:
@@ -90,15 +78,31 @@ class BodyModel:
         """The lengths [m] that this model has, measured on it in the neutral configuration."""
         return _lengths.measure_lengths(self.robot, self.table)
 
-    @cached_property
-    def chains(self) -> dict[str, Chain]:
-        """Segment → the joints that set its orientation, in the order of Pinocchio's joints."""
-        return _find_chains(self.pin, self.table)
+    @property
+    def chains(self) -> dict[str, tuple[int, ...]]:
+        """Segment → the joints that set its orientation, by Pinocchio's numbers, from the root outwards.
+
+        A segment of a limb is set by the joints nearest to it, as many as make three axes; others above (a clavicle)
+        rest. A segment of the spine is set by all joints between it and the segment above. There are none where it is
+        rigid with that. Segments are in the order of Pinocchio's joints.
+        """
+        return self._chains_and_parents[0]
+
+    @property
+    def parents(self) -> dict[str, str | None]:
+        """Segment → the segment above it; None for the first. On one joint the others hang on the first."""
+        return self._chains_and_parents[1]
 
     @cached_property
-    def parents(self) -> dict[str, str | None]:
-        """Segment → the segment above it; None for the first."""
-        return {name: self.chains[name].above for name in self.table.segments if name in self.chains}
+    def _chains_and_parents(self) -> tuple[dict[str, tuple[int, ...]], dict[str, str | None]]:
+        return _find_chains(self.pin, self.table)
+
+    def find_spherical(self, segment: str) -> int | None:
+        """Find the spherical joint nearest to a segment, which takes what its other joints leave; None: it has none.
+
+        With one every orientation of the segment can be followed.
+        """
+        return next((joint for joint in reversed(self.chains[segment]) if self.pin.nvs[joint] == 3), None)
 
     @cached_property
     def reaches(self) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
@@ -157,7 +161,7 @@ class BodyModel:
                 raise BadModel(f"{self.robot.name}: length {name} = {value!r}: above 0 and below 10 m is needed")
         robot = _lengths.with_lengths(self.robot, self.table, lengths)
         body = _body(robot, self.table, robot.name)
-        return replace(body, girdles=self.girdles, tissue_means=self.tissue_means)
+        return replace(body, girdles=self.girdles, personal=self.personal)
 
     def urdf(self) -> str:
         """This body as the text of a URDF that any tool reads."""
@@ -169,7 +173,8 @@ class BodyModel:
         return etree.tostring(urdf.write_xml(), pretty_print=True, xml_declaration=True, encoding="utf-8").decode()
 
 
-def _find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
+def _find_chains(model: pin.Model, table: BodyTable) -> tuple[dict[str, tuple[int, ...]], dict[str, str | None]]:
+    """Find `BodyModel.chains` and `BodyModel.parents`."""
     frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
     at: dict[int, str] = {}  # joint → the first of the segments that it carries; the others are rigid with that
     for segment, frame in frames.items():
@@ -181,15 +186,14 @@ def _find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
         paths[segment] = (None, path[1:]) if below is None else (at[path[below]], path[below + 1 :])
     # A joint that moves two segments at once rests.
     times = Counter(joint for _, joints in paths.values() for joint in joints)
-    chains = {}
+    chains, parents = dict[str, tuple[int, ...]](), dict[str, str | None]()
     for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
-        above, joints = paths.get(segment, (at[frame.parentJoint], []))
+        parents[segment], joints = paths.get(segment, (at[frame.parentJoint], []))
         free = [j for j in joints if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
         while not table.segments[segment].spine and sum(model.nvs[joint] for joint in free[1:]) >= 3:
             del free[0]
-        spherical = [joint for joint in free if model.nvs[joint] == 3]
-        chains[segment] = Chain(tuple(free), spherical[-1] if spherical else None, above)
-    return chains
+        chains[segment] = tuple(free)
+    return chains, {name: parents[name] for name in frames}
 
 
 def load_model(path: str | Path | None = None, lengths: Mapping[str, float] | None = None) -> BodyModel:
@@ -277,7 +281,7 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
     body = _body(*rename_links(robot, table), str(urdf))
     for segment in body.table.needed:
         above = body.parents[segment]
-        if above is not None and not body.chains[segment].joints:
+        if above is not None and not body.chains[segment]:
             raise BadModel(f"{table.where}: no joint moves {segment} against {above}; revolute joints are needed there")
     for name, hinge in body.table.hinges.items():
         if body.parents[hinge.moves] != hinge.on:

@@ -1,4 +1,4 @@
-"""Segment orientations → configuration of a body: exactly where its joints can, else as near as they come.
+"""Segment orientations → configuration and pose of a body: exactly where its joints can, else as near as they come.
 
 A segment on a spherical joint has its orientation: the joint takes the rotation relative to the measured segment above.
 In a spine of several joints each place takes an equal share of the tilt, and the spherical joint nearest to the segment
@@ -11,7 +11,7 @@ follow the limbs.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -19,10 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from ..compilation import kernel
 from ..errors import BadData, BadModel
-from ..rotations import conjugate, exp, log, multiply, product, rotation_about
+from ..rotations import conjugate, exp, log, multiply, product, rotation_about, unwrap_signs
 from .body import BodyModel
 from .girdle import follow_law
-from .links import compute_link_poses, describe_girdle, find_columns
+from .kinematics import Pose
+from .links import compute_joint_values, compute_link_poses, describe_girdle, find_columns, find_known_points
 from .table import check_segments
 
 _MEET_TOLERANCE = 1e-6  # [m] between joints of one place
@@ -37,17 +38,28 @@ def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray], *, 
 
     An unmeasured segment is rigid with the one above; `limits`: keep those of joints with one axis.
     """
-    solver = ConfigurationSolver(model, quat_WL, limits=limits)
+    solver = KinematicsSolver(model, quat_WL, limits=limits)
     return solver.solve(np.stack(list(quat_WL.values()), axis=1))
 
 
-class ConfigurationSolver:
-    """Configurations that follow orientations: of a whole recording, or of one pose after another.
+def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
+    """Compute the pose of `model` from segment orientations, as `solve_configuration` takes them."""
+    solver = KinematicsSolver(model, quat_WL, limits=limits)
+    return solver.solve_chunk(time, np.stack(list(quat_WL.values()), axis=1))
+
+
+class KinematicsSolver:
+    """Configurations and poses from orientations, chunk by chunk or one after another: each continues the last.
 
     Parameters
     ----------
-    segments, limits : the measured ones, in the order in which `solve` takes them; as of `solve_configuration`
+    segments, limits : the measured ones, in the order in which orientations come; as of `solve_configuration`
     start : (nq,) the configuration of a mechanism before the first frame; None: all joints at zero
+
+    Attributes
+    ----------
+    points : names of the known points
+    data : Pinocchio's data of the last pose of `compute_points`
     """
 
     def __init__(
@@ -60,21 +72,32 @@ class ConfigurationSolver:
         self._model, self.segments, self._neutral = model, tuple(segments), pin.neutral(m)
         self._last: np.ndarray | None = None  # (nq,) of the frame before
         fitted = _find_fitted(model, segments)
-        joints = sorted({joint for name in fitted for joint in model.chains[name].joints})
+        joints = sorted({joint for name in fitted for joint in model.chains[name]})
         if is_mechanism:
             self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
         self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
-        exact = [name for name in self.segments if model.chains[name].exact and not is_mechanism]
-        chains = [_ExactChain(model, name, self.segments, limits) for name in exact]
-        self._bent = [chain for chain in chains if len(chain.joints) > 1]
-        spherical = [chain.describe_spherical() for chain in chains if len(chain.joints) == 1]
+        self._bends, spherical = [], []
+        for name in () if is_mechanism else self.segments:
+            last = model.find_spherical(name)
+            if last is None:
+                continue
+            row, above, R_AL, R_AJ = _relate(model, name, self.segments)
+            if len(R_AJ) == 1:
+                (R,) = R_AJ.values()
+                spherical.append((row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[last]))
+            else:
+                self._bends.append(_make_bend(model, (row, above, R_AL, R_AJ), limits))
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
-        girdles = {name: girdle for name, girdle in model.table.girdles.items() if girdle.on in segments}
         self._girdles = [
             (describe_girdle(model, name, self.segments), np.array([m.idx_qs[m.getJointId(j)] for j in girdle.joints]))
-            for name, girdle in girdles.items()
+            for name, girdle in model.table.girdles.items()
+            if girdle.on in segments
         ]
+        self.points, self.data = tuple(find_known_points(model, segments)), m.createData()
+        self._frames = [model.point_frames[point] for point in self.points]
+        self._views = [self.data.oMf[m.getFrameId(frame)].translation for frame in self._frames]
+        self._last_quats: dict[str, np.ndarray] = {}
 
     def solve(self, quat_WL: np.ndarray) -> np.ndarray:
         """Solve for `q` (n, nq) of orientations (n, k, 4) xyzw; they continue the motion of the last call."""
@@ -82,8 +105,8 @@ class ConfigurationSolver:
         q[:] = self._neutral
         if self._spherical:
             _set_relative_rotations(quat_WL, *self._spherical, q)
-        for chain in self._bent:
-            chain.bend(q, quat_WL)
+        for bend in self._bends:
+            bend(q, quat_WL)
         if self._fit is not None:
             self._fit.run(q, quat_WL, self._last)
         for girdle, at in self._girdles:
@@ -94,6 +117,34 @@ class ConfigurationSolver:
         self._last = q[-1].copy()
         return q
 
+    def solve_chunk(self, time: np.ndarray, quat_WL: np.ndarray) -> Pose:
+        """Compute the pose of the next chunk: `time` (n,) [s], orientations (n, k, 4) xyzw of the segments."""
+        q, joints, columns = self.solve(quat_WL), {}, list(quat_WL.swapaxes(0, 1))
+        is_mechanism = self._model.table.is_mechanism
+        links = [*self._frames, *(self.segments if is_mechanism else ())]
+        R_WL, p_W = compute_link_poses(self._model, q, links, rotations=is_mechanism)
+        if is_mechanism:
+            columns = [Rotation.from_matrix(R).as_quat() for R in R_WL[:, len(self._frames) :].swapaxes(0, 1)]
+            joints = compute_joint_values(self._model.pin, q)
+        points = {point: p_W[:, k] for k, point in enumerate(self.points)}
+        named = zip(self.segments, columns, strict=True)
+        quats = {name: unwrap_signs(quat, self._last_quats.get(name)) for name, quat in named}
+        self._last_quats = {name: quat[-1].copy() for name, quat in quats.items()}
+        return Pose(time, quats, points, q, joints=joints)
+
+    def compute_points(self, quat_WL: np.ndarray) -> np.ndarray:
+        """Compute the points (p, 3) [m] in W of the next pose, from `quat_WL` (k, 4) xyzw."""
+        pin.framesForwardKinematics(self._model.pin, self.data, self.solve(quat_WL[None])[0])
+        return np.array(self._views)
+
+    def orient_segments(self, quat_WL: np.ndarray) -> np.ndarray:
+        """Return the orientations (k, 4) xyzw of the last pose, from the measured `quat_WL`: as `Pose` has them."""
+        if not self._model.table.is_mechanism:
+            return quat_WL
+        frames = [self.data.oMf[self._model.pin.getFrameId(segment)] for segment in self.segments]
+        fitted = Rotation.from_matrix([frame.rotation for frame in frames]).as_quat()
+        return np.where(np.einsum("ki,ki->k", fitted, quat_WL)[:, None] < 0.0, -fitted, fitted)
+
 
 def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
     """Find the measured segments that are fitted: of a mechanism all, of a person all of a limb whose joints cannot
@@ -102,68 +153,78 @@ def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
     if model.table.is_mechanism:
         return list(measured)
     limb: dict[str, str] = {}  # segment → the first of its limb; one of the spine is its own
-    for name, chain in model.chains.items():
-        spine = chain.above is None or any(model.table.segments[each].spine for each in (name, chain.above))
-        limb[name] = name if spine or chain.above is None else limb[chain.above]
-    inexact = {limb[name] for name in measured if model.chains[name].joints and not model.chains[name].exact}
+    for name in model.chains:
+        above = model.parents[name]
+        spine = above is None or any(model.table.segments[each].spine for each in (name, above))
+        limb[name] = name if spine or above is None else limb[above]
+    inexact = {limb[name] for name in measured if model.chains[name] and model.find_spherical(name) is None}
     fitted: list[str] = []
-    for name, chain in model.chains.items():
-        if name in measured and (limb[name] in inexact or chain.above in fitted):
+    for name in model.chains:
+        if name in measured and (limb[name] in inexact or model.parents[name] in fitted):
             fitted.append(name)
     return fitted
 
 
-class _ExactChain:
-    """The joints from the measured segment A above, or W, to a segment L; those behind its spherical joint rest."""
+_Relation = tuple[int, int, Rotation, dict[int, Rotation]]
 
-    def __init__(self, model: BodyModel, segment: str, segments: Sequence[str], limits: bool) -> None:
-        m, chain, data = model.pin, model.chains[segment], model.pin.createData()
-        above = chain.above
-        while above is not None and not (above in segments and model.chains[above].joints):
-            above = model.parents[above]
-        self._row, self._above = segments.index(segment), -1 if above is None else segments.index(above)
-        pin.forwardKinematics(m, data, pin.neutral(m))
-        R_AW = np.eye(3) if above is None else model.neutral_rotations[above].T
-        self._R_AL = Rotation.from_matrix(R_AW @ model.neutral_rotations[segment])  # with all joints at zero
-        joints = [joint for joint in chain.joints if joint <= (chain.spherical or 0)]
-        steps = np.diff([data.oMi[joint].translation for joint in joints], axis=0)
-        # Joints that meet in a point share a part of the bend.
-        self._share = 1.0 / (1 + np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE))
-        self.joints = []  # place in q, R_AJ, axis in A (None: spherical) and limits, from the root outwards
-        for joint in joints:
-            R_AJ, at = Rotation.from_matrix(R_AW @ data.oMi[joint].rotation), m.idx_qs[joint]
-            axis = R_AJ.apply(m.joints[joint].extract().axis) if m.nqs[joint] == 1 else None
-            ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else (-np.inf, np.inf)
-            self.joints.append((at, R_AJ, axis, ends))
 
-    def describe_spherical(self) -> tuple[int, int, np.ndarray, np.ndarray, int]:
-        """Return rows of L and A (-1: W), R_JA and R_LJ (4,) at zero, and place in `q` of one joint, J."""
-        at, R_AJ, _, _ = self.joints[0]
-        return self._row, self._above, R_AJ.inv().as_quat(), (self._R_AL.inv() * R_AJ).as_quat(), at
+def _relate(model: BodyModel, segment: str, segments: Sequence[str]) -> _Relation:
+    """Return how a segment L hangs on the measured segment A above, or on W: rows of L and A (-1: W) in `segments`,
+    R_AL, and R_AJ of the joints up to the spherical one, with all joints at zero; those behind it rest.
+    """
+    m, data, above = model.pin, model.pin.createData(), model.parents[segment]
+    while above is not None and not (above in segments and model.chains[above]):
+        above = model.parents[above]
+    pin.forwardKinematics(m, data, pin.neutral(m))
+    R_AW = np.eye(3) if above is None else model.neutral_rotations[above].T
+    R_AL = Rotation.from_matrix(R_AW @ model.neutral_rotations[segment])
+    last = model.find_spherical(segment) or 0
+    joints = [joint for joint in model.chains[segment] if joint <= last]
+    R_AJ = {joint: Rotation.from_matrix(R_AW @ data.oMi[joint].rotation) for joint in joints}
+    return segments.index(segment), -1 if above is None else segments.index(above), R_AL, R_AJ
 
-    def bend(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
-        """Write the joints' values into `q` (n, nq): an equal share of the tilt in each place, the rest in the last."""
-        R_WA = quat_WL[:, self._above] if self._above >= 0 else _IDENTITY
-        left = multiply(multiply(conjugate(R_WA), quat_WL[:, self._row]), self._R_AL.inv().as_quat())
+
+def _make_bend(model: BodyModel, relation: _Relation, limits: bool) -> Callable[[np.ndarray, np.ndarray], None]:
+    """Return the function that writes several joints' values into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw.
+
+    Each place takes an equal share of the tilt, the last joint the rest. Joints that meet in a point are one place.
+    """
+    m, data, (row, above, R_AL, R_AJ) = model.pin, model.pin.createData(), relation
+    pin.forwardKinematics(m, data, pin.neutral(m))
+    steps = np.diff([data.oMi[joint].translation for joint in R_AJ], axis=0)
+    places = 1 + np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE)
+    up = R_AL.apply([0.0, 0.0, 1.0])
+
+    def bend(q: np.ndarray, quat_WL: np.ndarray) -> None:
+        R_WA = quat_WL[:, above] if above >= 0 else _IDENTITY
+        left = multiply(multiply(conjugate(R_WA), quat_WL[:, row]), R_AL.inv().as_quat())
         # The turn about the vertical before the tilt is taken off; upside down no turn is better than another.
-        up = self._R_AL.apply([0.0, 0.0, 1.0])
         turn = np.column_stack([np.outer(left[:, :3] @ up, up), left[:, 3]])
         turn[np.linalg.norm(turn, axis=1) < 1e-9] = _IDENTITY
         turn /= np.linalg.norm(turn, axis=1)[:, None]
-        share = self._share * log(multiply(left, conjugate(turn)))  # (n, 3)
-        for k, (at, R_AJ, axis, ends) in enumerate(self.joints, start=1):
-            if axis is None:
-                rotation = exp(share) if k < len(self.joints) else left
-                q[:, at : at + 4] = multiply(multiply(R_AJ.inv().as_quat(), rotation), R_AJ.as_quat())
+        share = 1.0 / places * log(multiply(left, conjugate(turn)))  # (n, 3)
+        for k, (joint, R) in enumerate(R_AJ.items(), start=1):
+            at = m.idx_qs[joint]
+            if m.nqs[joint] == 4:
+                rotation = exp(share) if k < len(R_AJ) else left
+                q[:, at : at + 4] = multiply(multiply(R.inv().as_quat(), rotation), R.as_quat())
             else:
-                q[:, at] = np.clip(share @ axis, *ends)
+                axis = R.apply(m.joints[joint].extract().axis)
+                q[:, at] = share @ axis
+                if limits:
+                    q[:, at] = np.clip(q[:, at], m.lowerPositionLimit[at], m.upperPositionLimit[at])
                 rotation = rotation_about(axis, q[:, at])
             left = multiply(conjugate(rotation), left)
+
+    return bend
 
 
 @kernel
 def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ignore[no-untyped-def]
-    """Write R_JA R_AW R_WL R_LJ of each `describe_spherical` into `q` (n, nq), from `quat` (n, k, 4) xyzw."""
+    """Write R_JA R_AW R_WL R_LJ of each joint into `q` (n, nq), from `quat` (n, k, 4) xyzw.
+
+    `rows`, `above` are of L and A (-1: W) in `quat`, `left` R_JA and `right` R_LJ at zero, `at` its place in `q`.
+    """
     for j in range(len(rows)):
         for i in range(len(quat)):
             x, y, z, w = left[j, 0], left[j, 1], left[j, 2], left[j, 3]
@@ -279,7 +340,8 @@ def compute_orientation_residuals(
     Only for segments whose orientation the joints cannot reproduce exactly; for all of a mechanism.
     """
     fitted = _find_fitted(model, quat_WL)
-    limited = [name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)]
+    inexact = (name for name in model.chains if name in fitted or model.find_spherical(name) is None)
+    limited = [name for name in inexact if name in quat_WL]
     R_WL, _ = compute_link_poses(model, q, limited)
     return {
         segment: (Rotation.from_matrix(R_WL[:, k]).inv() * Rotation.from_quat(quat_WL[segment])).magnitude()

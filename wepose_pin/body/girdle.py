@@ -118,25 +118,3 @@ def follow_law(quat, on, moves, along, law, scale, own, out):  # type: ignore[no
         out[i, 1] = (1.0 + own[0]) * dy + own[2] + s * own[5]
         out[i, 2] = (1.0 + own[0]) * dz + own[3] + s * own[6]
         out[i, 3], out[i, 4], out[i, 5], out[i, 6] = dx, dy, dz, s
-
-
-class GirdleMotion(NamedTuple):
-    """A girdle's displacement over n samples."""
-
-    displacement: np.ndarray  # (n, 3) [m] in the frame of `on`
-    by_law: np.ndarray  # (n, 3) [m] of it, of the law as it stands
-    raised: np.ndarray  # (n,) s of the law; `MEAN_RAISED` where the limb's direction is not known
-    is_known: bool  # whether the limb's direction is known
-
-    @property
-    def jacobian(self) -> np.ndarray:
-        """(n, 3, 7) of the displacement by `PARAMETERS`."""
-        eye = np.tile(np.eye(3), (len(self.raised), 1, 1))
-        return np.concatenate((self.by_law[:, :, None], eye, self.raised[:, None, None] * eye), axis=2)
-
-    def residual_covariance(self, girdle: Girdle) -> np.ndarray:
-        """(n, 3) [m²] in the frame of `on`, by which the point leaves law and parameters."""
-        var = np.tile(np.square(girdle.residual_std), (len(self.raised), 1))
-        if not self.is_known:  # what the law would have said is not known either
-            var += self.raised[:, None] ** 2 * np.square((girdle.back[1], girdle.middle[0], girdle.up[0]))
-        return var

@@ -1,23 +1,18 @@
-"""`Pose`: the segments and points of a body over time, its table, and the solver that computes it from orientations."""
+"""`Pose`: the segments and points of a body over time, and its table."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import polars as pl
-from scipy.spatial.transform import Rotation
 
 from ..arguments import check_array, check_fields, check_names, check_numbers
 from ..errors import BadData, one_of
 from ..recording import EACH_TIME, check_time, format_span
-from ..rotations import unwrap_signs
-from .body import BodyModel
-from .configuration import ConfigurationSolver
-from .links import compute_axis_std, compute_joint_values, compute_link_poses, find_known_points
+from .links import compute_axis_std
 
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
 MAX_TABLE_NORM_DEVIATION = 1e-2  # the same in a table: a file may have few decimals
@@ -177,55 +172,3 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     )
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
     return Pose(time, quat_WL, points, segment_cov=segment_cov, point_cov=point_cov, gap=gap)
-
-
-def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
-    """Compute the pose of `model` from segment orientations `quat_WL`, segment → (n, 4) xyzw: `solve_configuration`."""
-    return KinematicsSolver(model, quat_WL, limits=limits).solve_chunk(time, quat_WL)
-
-
-class KinematicsSolver(ConfigurationSolver):
-    """Poses from orientations, chunk by chunk or one after another: each continues the motion of the last.
-
-    Parameters and errors as of `ConfigurationSolver`.
-
-    Attributes
-    ----------
-    points : names of the known points
-    data : Pinocchio's data of the last pose of `compute_points`
-    """
-
-    def __init__(self, model: BodyModel, segments: Collection[str], **options: Any) -> None:
-        super().__init__(model, segments, **options)
-        self.points, self.data = tuple(find_known_points(model, segments)), model.pin.createData()
-        self._frames = [model.point_frames[point] for point in self.points]
-        self._views = [self.data.oMf[model.pin.getFrameId(frame)].translation for frame in self._frames]
-        self._last_quats: dict[str, np.ndarray] = {}
-
-    def solve_chunk(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
-        """Compute the pose of the next chunk: `time` (n,) [s], segment → (n, 4) xyzw."""
-        q, joints = self.solve(np.stack([quat_WL[name] for name in self.segments], axis=1)), {}
-        is_mechanism = self._model.table.is_mechanism
-        links = [*self._frames, *(quat_WL if is_mechanism else ())]
-        R_WL, p_W = compute_link_poses(self._model, q, links, rotations=is_mechanism)
-        if is_mechanism:
-            fitted = enumerate(quat_WL, start=len(self._frames))
-            quat_WL = {name: Rotation.from_matrix(R_WL[:, k]).as_quat() for k, name in fitted}
-            joints = compute_joint_values(self._model.pin, q)
-        points = {point: p_W[:, k] for k, point in enumerate(self.points)}
-        quats = {name: unwrap_signs(quat, self._last_quats.get(name)) for name, quat in quat_WL.items()}
-        self._last_quats = {name: quat[-1].copy() for name, quat in quats.items()}
-        return Pose(time, quats, points, q, joints=joints)
-
-    def compute_points(self, quat_WL: np.ndarray) -> np.ndarray:
-        """Compute the points (p, 3) [m] in W of the next pose, from `quat_WL` (k, 4) xyzw."""
-        pin.framesForwardKinematics(self._model.pin, self.data, self.solve(quat_WL[None])[0])
-        return np.array(self._views)
-
-    def orient_segments(self, quat_WL: np.ndarray) -> np.ndarray:
-        """Return the orientations (k, 4) xyzw of the last pose, from the measured `quat_WL`: as `Pose` has them."""
-        if not self._model.table.is_mechanism:
-            return quat_WL
-        frames = [self.data.oMf[self._model.pin.getFrameId(segment)] for segment in self.segments]
-        fitted = Rotation.from_matrix([frame.rotation for frame in frames]).as_quat()
-        return np.where(np.einsum("ki,ki->k", fitted, quat_WL)[:, None] < 0.0, -fitted, fitted)

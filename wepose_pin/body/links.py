@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadModel
 from ..rotations import unwrap_signs
 from .body import BodyModel
-from .girdle import MEAN_RAISED, PARAMETERS, GirdleMotion, follow_law
+from .girdle import MEAN_RAISED, PARAMETERS, follow_law
 from .lengths import UNIVERSE
 
 _DETERMINED = 1e-9  # [m/rad or rad/rad] by which open motions may move what is determined: rounding
@@ -59,19 +59,27 @@ def describe_girdle(model: BodyModel, name: str, segments: Sequence[str]) -> tup
     return segments.index(girdle.on), moves, along, girdle.law, scale, own
 
 
-def move_girdles(
-    model: BodyModel, quat_WL: Mapping[str, np.ndarray], names: Iterable[str] | None = None
-) -> dict[str, GirdleMotion]:
-    """Compute girdle → its motion, of those `names`, or of all, that hang on a segment of `quat_WL` (n, 4) xyzw."""
-    motions, quat = {}, np.stack(list(quat_WL.values()), axis=1)
-    for name in model.table.girdles if names is None else names:
-        girdle = model.table.girdles[name]
-        if girdle.on in quat_WL:
-            motion, is_known = np.empty((len(quat), 7)), girdle.moves in quat_WL
-            follow_law(quat, *describe_girdle(model, name, list(quat_WL)), motion)
-            raised = motion[:, 6] if is_known else np.full(len(quat), MEAN_RAISED)
-            motions[name] = GirdleMotion(motion[:, :3], motion[:, 3:6], raised, is_known)
-    return motions
+def move_girdle(
+    model: BodyModel, name: str, quat_WL: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute how a girdle moves on a segment with orientations, segment → (n, 4) xyzw.
+
+    Returns
+    -------
+    displacement : (n, 3) [m] in the frame of `on`
+    jacobian : (n, 3, 7) of it by `PARAMETERS`
+    residual : (n, 3) [m²] in the frame of `on`, the variance by which the point leaves law and parameters
+    """
+    girdle, quat = model.table.girdles[name], np.stack(list(quat_WL.values()), axis=1)
+    motion, is_known = np.empty((len(quat), 7)), girdle.moves in quat_WL
+    follow_law(quat, *describe_girdle(model, name, list(quat_WL)), motion)
+    raised = motion[:, 6] if is_known else np.full(len(quat), MEAN_RAISED)
+    eye = np.tile(np.eye(3), (len(quat), 1, 1))
+    jacobian = np.concatenate((motion[:, 3:6, None], eye, raised[:, None, None] * eye), axis=2)
+    residual = np.tile(np.square(girdle.residual_std), (len(quat), 1))
+    if not is_known:  # what the law would have said is not known either
+        residual += raised[:, None] ** 2 * np.square((girdle.back[1], girdle.middle[0], girdle.up[0]))
+    return motion[:, :3], jacobian, residual
 
 
 def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str | None:
@@ -120,9 +128,9 @@ def _find_open_motions(
     if not model.table.is_mechanism:
         free = {
             joint
-            for name, chain in model.chains.items()
-            for joint in chain.joints
-            if (chain.spherical in (None, joint) if name in segments else name in model.table.needed)
+            for name, joints in model.chains.items()
+            for joint in joints
+            if (model.find_spherical(name) in (None, joint) if name in segments else name in model.table.needed)
         }
     columns = find_columns(m, sorted(free))
     q = pin.integrate(m, pin.neutral(m), rng.uniform(0.2, 0.9, m.nv) * rng.choice([-1.0, 1.0], m.nv))
@@ -184,13 +192,13 @@ def compute_point_covariances(
     covariances: dict[str, np.ndarray] = {}
     for point, parts in _find_ways(model, quat_WL, points).items():
         vectors: dict[str, np.ndarray] = {}  # segment → the sum of what rotates with it
-        for part in parts:
-            if part.segment is not None:
-                vectors[part.segment] = vectors.get(part.segment, 0.0) + part.vector
+        for segment, vector, *_ in parts:
+            if segment is not None:
+                vectors[segment] = vectors.get(segment, 0.0) + vector
         if not parts or not set(vectors) <= set(segment_cov):
             continue
-        columns = [column for part in parts for column in part.columns]
-        J = np.concatenate([part.jacobian for part in parts], axis=2)
+        columns = [column for _, _, own, _, _ in parts for column in own]
+        J = np.concatenate([jacobian for _, _, _, jacobian, _ in parts], axis=2)
         # Sample by sample: the bits of one large product would depend on the number of samples.
         cov = J @ shape_cov[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
         for segment, vector in vectors.items():
@@ -198,8 +206,8 @@ def compute_point_covariances(
             skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
             skew = skew - skew.swapaxes(1, 2)
             cov += skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
-        for part in parts:
-            cov += part.residual
+        for *_, residual in parts:
+            cov += residual
         for (near, far), shared in heading_cov.items():
             if near in vectors and far in vectors:
                 # A heading error ε moves the end of a vector by ε e_z × v.
@@ -210,14 +218,10 @@ def compute_point_covariances(
     return covariances
 
 
-class _Part(NamedTuple):
-    """A part of the way from the root to a point, which rotates with a measured segment."""
-
-    segment: str | None  # None: rigid with the root
-    vector: np.ndarray  # (n, 3) [m] in W
-    columns: Sequence[int]  # of the shape's parameters that change it
-    jacobian: np.ndarray  # (n, 3, c) of the vector by these
-    residual: np.ndarray | float = 0.0  # (n, 3, 3) [m²] in W by which it leaves what the shape says
+# A part of the way from the root to a point: the segment with which it rotates (None: the root), the vector (n, 3) [m]
+# in W, the parameters of the shape that change it, its Jacobian (n, 3, c) by these, and the covariance (n, 3, 3) [m²]
+# in W by which it leaves what the shape says.
+_Part = tuple[str | None, np.ndarray, Sequence[int], np.ndarray, np.ndarray | float]
 
 
 def _find_ways(
@@ -228,13 +232,13 @@ def _find_ways(
     lengths, neutral = np.array(list(model.lengths.values())), model.neutral_rotations
     n = len(next(iter(quat_WL.values())))
     known: dict[Any, _Part | None] = {}
-    for name, motion in move_girdles(model, quat_WL).items():
-        girdle, size = model.table.girdles[name], len(PARAMETERS)
-        first = len(lengths) + size * list(model.table.girdles).index(name)
-        R_on = R_WL[girdle.on]
-        residual = (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
-        vector = np.einsum("nij,nj->ni", R_on, motion.displacement)
-        known[name] = _Part(girdle.on, vector, range(first, first + size), R_on @ motion.jacobian, residual)
+    for k, (name, girdle) in enumerate(model.table.girdles.items()):
+        if girdle.on in R_WL:
+            displacement, jacobian, residual = move_girdle(model, name, quat_WL)
+            R_on, first = R_WL[girdle.on], len(lengths) + len(PARAMETERS) * k
+            vector = np.einsum("nij,nj->ni", R_on, displacement)
+            cov = (R_on * residual[:, None, :]) @ R_on.swapaxes(1, 2)
+            known[name] = girdle.on, vector, range(first, first + len(PARAMETERS)), R_on @ jacobian, cov
 
     def find_part(link: str, by_length: np.ndarray, constant: np.ndarray) -> _Part | None:
         carrier = None if link == UNIVERSE else find_carrier(model, link, R_WL)
@@ -244,7 +248,7 @@ def _find_ways(
         if carrier is not None and carrier != link:
             R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
         columns = np.flatnonzero(by_length.any(axis=0)).tolist()
-        return _Part(carrier, R_WK @ (by_length @ lengths + constant), columns, R_WK @ by_length[:, columns])
+        return carrier, R_WK @ (by_length @ lengths + constant), columns, R_WK @ by_length[:, columns], 0.0
 
     ways: dict[str, tuple[_Part, ...]] = {}
     for point in points:

@@ -226,7 +226,7 @@ def align_sensors(
             psi = compute_heading_offset(R_VS, R_WS_start)
             if segment in subject.start_pose_offset:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
-                misfit = misfit - subject.start_pose_offset[segment].tilt
+                misfit = misfit - subject.start_pose_offset[segment][:2]
                 misfit_cov = np.diag(start_pose.std(segment, again=True)[:2] ** 2)
             stds = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5
             if stds > MOUNT_MOVED_STDS:

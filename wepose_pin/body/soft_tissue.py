@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
 from ..compilation import kernel
 from ..rotations import product, rotate_by_vector
-from .table import ZERO, BodyTable
+from .body import BodyModel
+from .table import ZERO, SoftTissue
 
 # Least squared cosine of half the angle between long axes at which the twist between them counts in full.
 LEAST_TWIST_COSINE = 0.1
@@ -20,76 +19,76 @@ USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(5.3), 0.25
 SCATTER_LOG_STD = 0.5
 
 
-class TissueMean(NamedTuple):
-    """What a segment has turned beyond its sensor, in the mean of one person; about the segment's axes."""
-
-    share: float  # of the means that the table states for tilt and raised arms
-    lag: float  # [rad/rad] per angle of twist that the sensor shows
-    start: float = 0.0  # [rad] about z in the start pose
-    start_std: float = 0.0  # [rad] one standard deviation of `start`
-    scatter: float = 1.0  # size of what varies beyond the means, as a share of that among all people
-
-
 def estimate_scatter(hinge_stds: Collection[float]) -> float:
-    """Estimate `TissueMean.scatter` of the angles [rad] by which segments leave their hinges, by empirical Bayes."""
+    """Estimate the size of what varies beyond a person's means, as a share of that among all people.
+
+    It follows from the angles [rad] by which segments leave their hinges, by empirical Bayes.
+    """
     if not hinge_stds:
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + HINGE_LOG_STD**2)
     return float(np.exp(weight * np.mean(np.log(np.array([*hinge_stds]) / USUAL_HINGE_STD))))
 
 
-def correct_table(table: BodyTable, means: Mapping[str, TissueMean]) -> BodyTable:
-    """Return the table with the standard deviations of soft tissue that remain beyond a person's means."""
-    segments = dict(table.segments)
-    for name, mean in means.items():
-        segment, tissue = segments[name], segments[name].soft_tissue
-        terms = (tissue.std, ZERO), (tissue.per_tilt, tissue.mean_per_tilt), (tissue.per_raised, tissue.mean_per_raised)
-        std, per_tilt, per_raised = (
-            tuple(mean.scatter * np.sqrt(np.maximum(np.square(std) - np.square(own), 0.0))) for std, own in terms
-        )
-        per_twist = mean.scatter * np.sqrt(max(tissue.per_twist**2 - tissue.mean_per_twist**2, 0.0))
-        segments[name] = segment._replace(
-            soft_tissue=tissue._replace(std=std, per_tilt=per_tilt, per_twist=per_twist, per_raised=per_raised),
-            start_std=(*segment.start_std[:2], mean.start_std),
-        )
-    return replace(table, segments=segments)
+def make_personal(tissue: SoftTissue, share: float, lag: float, scatter: float) -> SoftTissue:
+    """Return the soft tissue of one person: its own means, and the standard deviations that remain beyond them.
+
+    Parameters
+    ----------
+    share : of the population's means for tilt and raised arms that the person has
+    lag : [rad/rad] `mean_per_twist` of the person
+    scatter : as of `estimate_scatter`
+    """
+
+    def remain(std: Sequence[float], mean: Sequence[float]) -> tuple[float, float, float]:
+        x, y, z = scatter * np.sqrt(np.maximum(np.square(std) - np.square(mean), 0.0))
+        return x, y, z
+
+    def scale(mean: Sequence[float]) -> tuple[float, float, float]:
+        x, y, z = (share * each for each in mean)
+        return x, y, z
+
+    return tissue._replace(
+        std=remain(tissue.std, ZERO),
+        per_tilt=remain(tissue.per_tilt, tissue.mean_per_tilt),
+        per_twist=scatter * np.sqrt(max(tissue.per_twist**2 - tissue.mean_per_twist**2, 0.0)),
+        per_raised=remain(tissue.per_raised, tissue.mean_per_raised),
+        mean_per_tilt=scale(tissue.mean_per_tilt),
+        mean_per_twist=lag,
+        mean_per_raised=scale(tissue.mean_per_raised),
+    )
 
 
-class SoftTissueCorrection:
-    """Corrects the orientations of segments by the means of a person's soft tissue, sample by sample.
+def make_correction(body: BodyModel, segments: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that corrects orientations (..., k, 4) xyzw of k segments by a person's soft tissue.
+
+    Only segments whose means the person's calibration shows are corrected (`BodyModel.personal`).
 
     Parameters
     ----------
     segments : those with a sensor, in the order of the columns of orientations
     """
+    table, columns = body.table, {name: k for k, name in enumerate(segments)}
+    names = [name for name in table.segments if name in columns and name in body.personal]
+    tissues = [body.personal[name].soft_tissue for name in names]
+    raised = np.reshape([[segment in each.raised for segment in segments] for each in tissues], (-1, len(segments)))
+    terms = (
+        np.array([columns[name] for name in names], dtype=np.int64),
+        np.array([columns.get(table.segments[name].soft_tissue.relative_to, -1) for name in segments], np.int64),
+        np.array([table.segments[name].along for name in segments]),
+        np.array([tissue.mean_per_tilt for tissue in tissues]).reshape(-1, 3),
+        raised / np.maximum(1, raised.sum(axis=1, keepdims=True)),
+        np.array([tissue.mean_per_raised for tissue in tissues]).reshape(-1, 3),
+        np.array([tissue.mean_per_twist for tissue in tissues]),
+        np.array([body.personal[name].start_mean[2] for name in names]),
+    )
 
-    def __init__(self, table: BodyTable, means: Mapping[str, TissueMean], segments: Sequence[str]) -> None:
-        columns = {name: k for k, name in enumerate(segments)}
-        names = [name for name in table.segments if name in columns and name in means]
-        tissues = [table.segments[name].soft_tissue for name in names]
-        share = np.array([means[name].share for name in names])[:, None]
-        raised = np.reshape([[segment in each.raised for segment in segments] for each in tissues], (-1, len(segments)))
-        self._terms = (
-            np.array([columns[name] for name in names], dtype=np.int64),
-            np.array([columns.get(table.segments[name].soft_tissue.relative_to, -1) for name in segments], np.int64),
-            np.array([table.segments[name].along for name in segments]),
-            share * np.array([tissue.mean_per_tilt for tissue in tissues]).reshape(-1, 3),
-            raised / np.maximum(1, raised.sum(axis=1, keepdims=True)),
-            share * np.array([tissue.mean_per_raised for tissue in tissues]).reshape(-1, 3),
-            np.array([means[name].lag for name in names]),
-            np.array([means[name].start for name in names]),
-        )
-
-    def correct_segments(self, quat_WL: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """Return segment → orientations (n, 4) xyzw, of all segments, as `correct`."""
-        quats = self.correct(np.stack(list(quat_WL.values()), axis=1))
-        return {name: np.ascontiguousarray(quats[:, k]) for k, name in enumerate(quat_WL)}
-
-    def correct(self, quat_WL: np.ndarray) -> np.ndarray:
-        """Return the orientations (..., k, 4) xyzw of the segments from those that their sensors show."""
+    def correct(quat_WL: np.ndarray) -> np.ndarray:
         corrected = quat_WL.copy()
-        _correct(corrected.reshape(-1, *quat_WL.shape[-2:]), *self._terms)
+        _correct(corrected.reshape(-1, *quat_WL.shape[-2:]), *terms)
         return corrected
+
+    return correct
 
 
 @kernel

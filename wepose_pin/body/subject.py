@@ -29,8 +29,8 @@ from ..errors import BadData, BadModel, BadOption, BadSubject
 from .anthropometry import compute_population_lengths
 from .body import BodyModel
 from .girdle import PARAMETERS
-from .soft_tissue import TissueMean, estimate_scatter
-from .table import BodyTable, load_table
+from .soft_tissue import estimate_scatter, make_personal
+from .table import BodyTable, Segment, load_table
 
 # A row of a covariance, other than lengths.
 _ROW = re.compile(r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law")
@@ -45,8 +45,9 @@ HINGE_PLANE_STD = np.deg2rad(10.0)
 MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person has
 
 # Limits of a file; whether numbers are plausible says the quality of the calibration.
-_OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4)
-_DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=4)  # of a heading: up to 100 deg/s
+_OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4, each=("x_deg", "y_deg", "std_deg"))
+# Of a heading: up to 100 deg/s.
+_DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=4, each=("rate_deg_min", "std_deg_min"))
 _UNIT = Key(least=-1.001, most=1.001, digits=9)  # of a component of a unit vector
 _MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",))
 _GIRDLE = Key(least=-LONGEST, most=LONGEST, each=PARAMETERS, digits=6)
@@ -64,20 +65,6 @@ class Hinge(NamedTuple):
     twist_lag: Annotated[float | None, Key(least=-10.0, most=10.0, digits=4)] = None
 
 
-class StartPoseOffset(NamedTuple):
-    """The offset of a segment from the start pose in the calibration."""
-
-    tilt: Annotated[np.ndarray, replace(_OFFSET, each=("x_deg", "y_deg"))]  # (2,) [rad] about x and y of W
-    std: Annotated[NonNegative, replace(_OFFSET, least=0.0)]  # [rad] of each
-
-
-class HeadingDrift(NamedTuple):
-    """The drift of a sensor's heading in the calibration, from the remaining bias of its gyroscope."""
-
-    rate: Annotated[float, _DRIFT]  # [rad/s]
-    std: Annotated[NonNegative, replace(_DRIFT, least=0.0)]  # [rad/s]
-
-
 @dataclass(frozen=True)
 class Subject:
     """A person's lengths, mounts and what else a calibration estimates.
@@ -92,9 +79,10 @@ class Subject:
     mounts : segment → `quat_LS` (4,) xyzw, its sensor's mount (S to L); empty where none is calibrated
     note : where the numbers come from, in a few words
     hinges : joint → `Hinge`, its axis, where a calibration estimated it
-    start_pose_offset : segment → `StartPoseOffset`, its angles to the start pose in the calibration, which a person
-        nearly repeats
-    heading_drift : segment → `HeadingDrift` of its sensor in the calibration; on another day it has a similar size
+    start_pose_offset : segment → (3,) [rad] its angles to the start pose in the calibration, about x and y of W, which
+        a person nearly repeats, and the standard deviation of each
+    heading_drift : segment → (2,) [rad/s] drift of its sensor's heading in the calibration, by what remained of the
+        gyroscope's bias, and its standard deviation; on another day it has a similar size
     girdles : shoulder point → (7,) by which the person differs from the body's law of the shoulder girdle: a share of
         the law, then a displacement x, y, z [m] at rest and another [m] with the arm raised by 90°
     quality : "pass", "poor" or "fail", of the calibration that estimated it; empty where none did
@@ -107,8 +95,8 @@ class Subject:
     mounts: Annotated[Mapping[str, np.ndarray], _MOUNT] = field(default_factory=dict)
     note: str = ""
     hinges: Mapping[str, Hinge] = field(default_factory=dict)
-    start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
-    heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
+    start_pose_offset: Annotated[Mapping[str, np.ndarray], _OFFSET] = field(default_factory=dict)
+    heading_drift: Annotated[Mapping[str, np.ndarray], _DRIFT] = field(default_factory=dict)
     girdles: Annotated[Mapping[str, np.ndarray], _GIRDLE] = field(default_factory=dict)
     quality: Literal["", "pass", "poor", "fail"] = ""
 
@@ -169,8 +157,8 @@ class Subject:
         check_fields(self, where)
         arrays: dict[str, tuple[Any, int]] = {f"mounts.{name}": (quat, 4) for name, quat in self.mounts.items()}
         arrays |= {f"hinges.{name}.axis": (hinge.axis, 3) for name, hinge in self.hinges.items()}
-        arrays |= {f"start_pose_offset.{name}.tilt": (each.tilt, 2) for name, each in self.start_pose_offset.items()}
-        arrays |= {f"girdles.{name}": (values, len(PARAMETERS)) for name, values in self.girdles.items()}
+        for field_name, size in (("start_pose_offset", 3), ("heading_drift", 2), ("girdles", len(PARAMETERS))):
+            arrays |= {f"{field_name}.{name}": (each, size) for name, each in getattr(self, field_name).items()}
         try:
             named = [row for row in self.order if not _ROW.fullmatch(row)]
             check_names(f"{where}covariance.order", named, self.lengths)
@@ -210,16 +198,16 @@ class Subject:
         """Return the body with this person's lengths, girdles and means of soft tissue, unknown if `remounted`."""
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
         girdles = {name: own for name, own in self.girdles.items() if name in body.table.girdles}
-        return replace(body, girdles=girdles, tissue_means={} if remounted else self._find_tissue_means(body))
+        return replace(body, girdles=girdles, personal={} if remounted else self._find_personal(body))
 
-    def _find_tissue_means(self, body: BodyModel) -> dict[str, TissueMean]:
-        """Find segment → what it has turned beyond its sensor in this person's mean; nothing where no hinge shows it.
+    def _find_personal(self, body: BodyModel) -> dict[str, Segment]:
+        """Find segment → its properties with this person's means of soft tissue; nothing where no hinge shows them.
 
         A hinge shows how far the sensor above it lags behind a twist. The share of the usual lag that it has is
         assumed for all soft tissue. The axis of a hinge also shows how far the person twists the segment above it, and
         what hangs on that, in the start pose. How well the hinges hold shows how far all of this varies.
         """
-        segments, hinges, means = body.table.segments, body.table.hinges, dict[str, TissueMean]()
+        segments, hinges, personal = body.table.segments, body.table.hinges, dict[str, Segment]()
         shown = {hinges[joint].on: joint for joint, hinge in self.hinges.items() if hinge.twist_lag is not None}
         usual = sum(segments[name].soft_tissue.mean_per_twist for name in shown)
         if not usual:
@@ -231,9 +219,9 @@ class Subject:
             lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
             start_var = segment.start_std[2] ** 2 - segment.start_mean[2] ** 2
             carrier = body.parents.get(name)
-            if carrier in means:
-                start += means[carrier].start
-                start_var += means[carrier].start_std ** 2 - segments[carrier].start_std[2] ** 2
+            if carrier in personal:
+                start += personal[carrier].start_mean[2]
+                start_var += personal[carrier].start_std[2] ** 2 - segments[carrier].start_std[2] ** 2
             start_var = max(start_var, 0.0)
             if name in shown:
                 usual_axis, hinge = np.array(hinges[shown[name]].axis), self.hinges[shown[name]]
@@ -243,15 +231,19 @@ class Subject:
                 plane_var = (scatter * HINGE_PLANE_STD) ** 2
                 weight = start_var / (start_var + plane_var)
                 start, start_var = float(weight * angle), weight * plane_var
-            means[name] = TissueMean(share, lag, start, float(np.sqrt(start_var)), scatter)
-        return means
+            personal[name] = segment._replace(
+                soft_tissue=make_personal(segment.soft_tissue, share, lag, scatter),
+                start_mean=(*segment.start_mean[:2], start),
+                start_std=(*segment.start_std[:2], float(np.sqrt(start_var))),
+            )
+        return personal
 
     def turn_hinges(self, body: BodyModel) -> dict[str, Hinge]:
         """Return the hinges with their axes in the segments as the means of soft tissue correct them."""
         hinges = {}
         for joint, hinge in self.hinges.items():
-            mean = body.tissue_means.get(body.table.hinges[joint].on)
-            turn = Rotation.from_rotvec([0.0, 0.0, 0.0 if mean is None else -mean.start])
+            own = body.personal.get(body.table.hinges[joint].on)
+            turn = Rotation.from_rotvec([0.0, 0.0, 0.0 if own is None else -own.start_mean[2]])
             hinges[joint] = hinge._replace(axis=turn.apply(hinge.axis))
         return hinges
 

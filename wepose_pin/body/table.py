@@ -117,12 +117,6 @@ class HingeJoint(NamedTuple):
     tilt_std: Angle = float(np.deg2rad(5.0))  # of the axis's rotation about the direction across both
 
 
-class Place(NamedTuple):
-    """Where a sensor usually sits, in words."""
-
-    place: str
-
-
 class Drawing(NamedTuple):
     """What is drawn of a body: lines through points, limb by limb, and the points whose path is drawn."""
 
@@ -164,7 +158,6 @@ class BodyTable:
     # Name → joint of the URDF → value [rad or m].
     poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     pairs: Annotated[Mapping[str, str], Key(of="names")] = field(default_factory=dict)  # left → right
-    sensors: Mapping[str, Place] = field(default_factory=dict)
     draw: Drawing = field(default_factory=Drawing)
     where: Annotated[str, None] = "segments"  # the table's file, for messages
 
@@ -269,7 +262,6 @@ def prune_table(table: BodyTable) -> BodyTable:
         lengths=complete(table.lengths, lambda _, length: (length.segment, *length.start, *length.end)),
         hinges=complete(table.hinges, lambda _, hinge: (hinge.on, hinge.moves)),
         girdles=complete(table.girdles, lambda point, girdle: (point, girdle.on, girdle.moves)),
-        sensors=complete(table.sensors, lambda segment, _: (segment,)),
         draw=Drawing(limbs, tuple(point for point in table.draw.paths if point in known)),
     )
     known |= {*pruned.lengths, *pruned.hinges}
@@ -359,7 +351,6 @@ def _check_table(table: BodyTable, top: TomlTable) -> None:
     names = (*table.segments, *table.points, *table.lengths, *table.hinges)
     for key, used, known in (
         ("girdles", table.girdles, table.points),
-        ("sensors", table.sensors, table.segments),
         ("pairs", table.pairs, names),
         ("draw", (*(point for limb in table.draw.limbs for point in limb), *table.draw.paths), table.points),
     ):

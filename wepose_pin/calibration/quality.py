@@ -179,7 +179,7 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
             _check(Diagnostic("motion-too-small", INFO, value=calibration.effective_sample_size), SAMPLES),
             _check(Diagnostic("closure-open", INFO, value=share, facts=facts), OPEN_SHARE),
         ]
-    tilts = {name: float(np.linalg.norm(own.tilt)) for name, own in calibration.subject.start_pose_offset.items()}
+    tilts = {name: float(np.linalg.norm(own[:2])) for name, own in calibration.subject.start_pose_offset.items()}
     if tilts:
         name = max(tilts, key=tilts.__getitem__)
         checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.girdle import PARAMETERS
 from ..body.soft_tissue import estimate_scatter
-from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
+from ..body.subject import Hinge, Subject, mount_rows
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import NoSolution
 from .couplings import add_couplings
@@ -113,7 +113,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
 
 
 def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray, scatter: float) -> Subject:
-    """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`TissueMean`)."""
+    """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`estimate_scatter`)."""
     R_VS_start, layout, x = problem.filtered.R_VS_start, fit.observations.layout, fit.x
     std, R_WS_start, offsets, drifts = np.sqrt(np.diag(x_cov)), {}, {}, {}
     headings = dict(zip(layout.sensors, x[layout.heading].tolist(), strict=True))
@@ -124,8 +124,8 @@ def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndar
     for name, tilt, drift in zip(layout.sensors, layout.tilt, layout.drift, strict=True):
         R_WS_start[name] = Rotation.from_rotvec(-np.append(x[tilt], 0.0)) * R_WS_start[name]
         offset_std = np.minimum(std[tilt], np.pi)  # no angle is more uncertain than half a turn
-        offsets[name] = StartPoseOffset(x[tilt], float(np.sqrt(np.mean(offset_std**2))))
-        drifts[name] = HeadingDrift(float(x[drift]), float(std[drift]))
+        offsets[name] = np.append(x[tilt], np.sqrt(np.mean(offset_std**2)))
+        drifts[name] = np.array([x[drift], std[drift]])
     order, covariance = _project_to_subject(problem, layout, x_cov, scatter)
     girdles = dict(zip(layout.girdles, x[layout.girdle], strict=True))
     return replace(

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
-from ..body.kinematics import KinematicsSolver
+from ..body.configuration import KinematicsSolver
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol

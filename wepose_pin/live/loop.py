@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..body import BodyModel, load_table
-from ..body.kinematics import KinematicsSolver
+from ..body.configuration import KinematicsSolver
 from ..body.links import compute_axis_std
 from ..body.mounts import compute_start_configuration
-from ..body.soft_tissue import SoftTissueCorrection
+from ..body.soft_tissue import make_correction
 from ..body.subject import parse_subject, subject_toml
 from ..body.table import check_segments
 from ..diagnostics import Diagnostic
@@ -93,8 +93,8 @@ class LiveLoop(Stage):
             _ = self.model.reaches
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
-        self._soft_tissue = SoftTissueCorrection(self.model.table, self.model.tissue_means, tuple(source.sensors))
-        self._soft_tissue.correct(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
+        self._correct_soft_tissue = make_correction(self.model, tuple(source.sensors))
+        self._correct_soft_tissue(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
         self._tracker = Tracker(setup.subject, model=self.model, method=method, causal=True)
         self._estimator: Tracker | None = None  # from when the start pose is found
         self._header = setup.header(source.sensors, source.orientations)
@@ -180,7 +180,7 @@ class LiveLoop(Stage):
             while self._edges and self._edges[0][0] <= ticks.time[n]:
                 _, phase, begins = self._edges.popleft()
                 estimator.mark_phase(phase, begins=begins)
-            quat_WL = self._soft_tissue.correct(estimator.step(ticks.gyro_S[n], ticks.accel_S[n]))
+            quat_WL = self._correct_soft_tissue(estimator.step(ticks.gyro_S[n], ticks.accel_S[n]))
             self._update_std(estimator, ticks.first + n)
             self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:

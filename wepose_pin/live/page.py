@@ -36,7 +36,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from ..body import BodyModel
-from ..body.kinematics import KinematicsSolver
+from ..body.configuration import KinematicsSolver
 from ..body.links import find_known_links, find_known_points
 from ..errors import BadOption
 from ..report.viewer import DARK, LIGHT, Mesh, backdrop, choose_trail_colour, filled, find_floor, scene, view, visible
@@ -216,7 +216,7 @@ class PoseEncoder:
     def start(self, info: StreamInfo) -> None:
         model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
         known = find_known_links(model, info.segments)
-        moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
+        moved = {chain[-1]: segment for segment, chain in model.chains.items() if chain}
         sensors = []  # of each link the row of the sensor that places it; -1: none
         for frame in self._frames:
             joint = model.pin.frames[frame].parentJoint

@@ -412,8 +412,7 @@ def _format_session(about: Description, folder: Path, body: BodyTable, model: Pa
             lines.append("# clasp = [[FROM, TO]]   # for wepose calibrate: the seconds in which the palms are together")
     for segment in sorted(about.sensors, key=lambda name: segments.index(name) if name in segments else 99):
         known = segment in segments
-        place = body.sensors[segment].place if segment in body.sensors else ""
-        table = [f"[sensors.{segment if known else 'SEGMENT'}]{f'   # usually {place}' if place else ''}"]
+        table = [f"[sensors.{segment if known else 'SEGMENT'}]"]
         table += format_keys(about.sensors[segment], about.checks)
         if recording is not None and not recording.sensors[segment].aligned:
             table.append(_propose_mount(recording, segment, static))

@@ -146,8 +146,8 @@ def tabulate_mounts(calibration: Calibration) -> Table:
         off = (Rotation.from_quat(compute_mount(up, forward)).inv() * Rotation.from_quat(quat_LS)).magnitude()
         axes = f"{up} up, {forward} ahead, turned {np.degrees(off):.0f}°".replace("-", "−")
         stds = (number(std, 1, "°") for std in _find_mount_stds(subject, name))
-        at_start = number(np.degrees(np.linalg.norm(offset.tilt)) if offset else np.nan, 1, "°")
-        rate = number(60.0 * np.degrees(drift.rate), 1, " °/min", "+") if drift else ""
+        at_start = number(np.degrees(np.linalg.norm(offset[:2])) if offset is not None else np.nan, 1, "°")
+        rate = number(60.0 * np.degrees(drift[0]), 1, " °/min", "+") if drift is not None else ""
         rows.append([plain(name), axes, *stds, at_start, rate])
     return Table("", ["sensor", "nearest axes", "tilt ±", "heading ±", "off at start", "drift"], rows)
 

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from ..body import BodyModel, BodyTable
 from ..body.kinematics import Pose
 from ..body.links import compute_axis_std, compute_point_covariances
-from ..body.soft_tissue import correct_table
 from ..body.subject import Subject
 from ..filters import Orientation
 from ..recording import OrientationSensor, Recording
@@ -190,7 +189,7 @@ def compute_error_budget(tracked: TrackResult) -> dict[str, dict[str, float]]:
     exact = compute_variances(zero, none)  # what leaves the law of the girdles
     with_girdles, with_lengths = compute_variances(zero, of_girdles), compute_variances(zero, shape_cov)
     independent = compute_variances(total, shape_cov)
-    table = correct_table(body.table, body.tissue_means)
+    table = body.personal_table
     parts = {point: {GIRDLES: value, LENGTHS: with_lengths[point] - value} for point, value in with_girdles.items()}
     for name in total:
         own_soft = compute_variances({**zero, name: compute_soft_tissue_covariance(table, quat_WL, name)}, none)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..body import BodyModel
 from ..body.body import load_sensed_model
-from ..body.kinematics import KinematicsSolver
+from ..body.configuration import KinematicsSolver
 from ..body.links import compute_point_covariances
 from ..body.mounts import (
     MEASURED_ORIENTATION_STD,
@@ -27,7 +27,7 @@ from ..body.mounts import (
     compute_start_heading_var,
     find_start_pose,
 )
-from ..body.soft_tissue import SoftTissueCorrection, correct_table
+from ..body.soft_tissue import make_correction
 from ..body.subject import Subject, population_subject
 from ..body.table import check_segments
 from ..compilation import kernel
@@ -188,7 +188,7 @@ class Tracker:
         if subject is None and chosen is not None:  # a chosen model has its person's lengths
             person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
         self._person, self._body = person, person.shape(body, remounted=first.remounted)
-        table = correct_table(self._body.table, self._body.tissue_means)
+        table = self._body.personal_table
         self._start_pose = replace(start_pose, table=table)
 
     # Orientations of segments ----------------------------------------------------------------------------------------
@@ -356,8 +356,8 @@ class Tracker:
         if self._kinematics is None:
             start = self._start_pose.q
             self._kinematics = KinematicsSolver(body, self.names, limits=self._limits, start=start)
-        tissue = SoftTissueCorrection(body.table, body.tissue_means, self.names)
-        pose = self._kinematics.solve_chunk(chunk.time, tissue.correct_segments(segments.quat_WL))
+        correct = make_correction(body, self.names)
+        pose = self._kinematics.solve_chunk(chunk.time, correct(np.stack(list(segments.quat_WL.values()), axis=1)))
         shape_cov = self._person.shape_covariance(body.table)
         shared = {} if correction is None else correction.correlate_segments(chunk.time, covariances)
         point_cov = compute_point_covariances(body, pose.quat_WL, covariances, shape_cov, pose.q, shared)

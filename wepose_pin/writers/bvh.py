@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..body.configuration import solve_configuration
-from ..body.links import compute_link_poses, find_known_points, move_girdles
+from ..body.links import compute_link_poses, find_known_points, move_girdle
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..rotations import conjugate, multiply
@@ -120,9 +120,11 @@ def _compute_root_position(motion: Motion, root: Bone) -> np.ndarray:
     at_rest = []
     for point in anchors:
         moved = np.zeros((len(pose.time), 3))
-        for name, girdle in move_girdles(model, pose.quat_WL, model.point_girdles[point]).items():
-            displacement = girdle.displacement - model.girdle_parameters(name)[1:4]
-            moved += np.einsum("nij,nj->ni", R_WL[model.table.girdles[name].on], displacement)
+        for name in model.point_girdles[point]:
+            on = model.table.girdles[name].on
+            if on in R_WL:
+                displacement = move_girdle(model, name, pose.quat_WL)[0] - model.girdle_parameters(name)[1:4]
+                moved += np.einsum("nij,nj->ni", R_WL[on], displacement)
         at_rest.append(pose.points[point] - moved)
     return np.asarray(np.mean(at_rest, axis=0) - np.einsum("nij,j->ni", R_WL[model.table.reference], root.end))
 

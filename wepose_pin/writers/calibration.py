@@ -47,8 +47,8 @@ def _document(calibration: Calibration) -> dict[str, Any]:
             }
             for segment, quat in subject.mounts.items()
         },
-        "start_pose_offset_deg": {name: np.degrees(offset.tilt) for name, offset in subject.start_pose_offset.items()},
-        "heading_drift_deg_min": {name: 60.0 * np.degrees(drift.rate) for name, drift in subject.heading_drift.items()},
+        "start_pose_offset_deg": {name: np.degrees(offset[:2]) for name, offset in subject.start_pose_offset.items()},
+        "heading_drift_deg_min": {name: 60.0 * np.degrees(drift[0]) for name, drift in subject.heading_drift.items()},
         "hinges": {
             joint: {"axis": subject.hinges[joint].axis, "rms_deg": _number(np.degrees(rms))}
             for joint, rms in calibration.hinge_rms.items()

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..angles import NEAR_LOCK, euler
 from ..body import BodyModel
-from ..body.configuration import solve_configuration
-from ..body.kinematics import Pose, compute_pose, find_usual_rate
+from ..body.configuration import compute_pose, solve_configuration
+from ..body.kinematics import Pose, find_usual_rate
 from ..body.links import compute_joint_values
 from ..body.tree import joint_axis, joint_placement, parse_tree
 from ..body.urdf import read_urdf
