@@ -8,8 +8,8 @@ not travel. Other joints stay as they are.
 `table` is what stands on a body, and its file; `tree` the joints, and links by the table's names, in our frames;
 `lengths` measures and stretches, and has the way from the root to each point; `body` is what they make (`BodyModel`).
 A person's numbers stand in `subject`, those of all people in `anthropometry`; `mounts` finds how sensors are mounted
-from the start pose. `configuration` solves for the joints from orientations of segments, `links` places links and
-points and says how well they are known, `kinematics` does both (`Pose`).
+from the start pose. `configuration` solves for joints and points from orientations of segments (`KinematicsSolver`),
+which make a `Pose` (`kinematics`); `links` places links and points and says how well they are known.
 """
 
 from .anthropometry import SEXES, convert_breadths, list_breadths
