@@ -356,8 +356,7 @@ class Tracker:
         if self._kinematics is None:
             start = self._start_pose.q
             self._kinematics = KinematicsSolver(body, self.names, limits=self._limits, start=start)
-        correct = make_correction(body, self.names)
-        pose = self._kinematics.solve_chunk(chunk.time, correct(np.stack(list(segments.quat_WL.values()), axis=1)))
+        pose = self._kinematics.solve_chunk(chunk.time, make_correction(body, self.names)(quat_WL))
         shape_cov = self._person.shape_covariance(body.table)
         shared = {} if correction is None else correction.correlate_segments(chunk.time, covariances)
         point_cov = compute_point_covariances(body, pose.quat_WL, covariances, shape_cov, pose.q, shared)
