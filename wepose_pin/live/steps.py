@@ -113,7 +113,7 @@ def find_sensors(guide: Guide, _: bool) -> StepRun:
 def assign_segments(guide: Guide, asked_for: bool) -> StepRun:
     """Find by shaking which sensor sits on which segment; the ends of limbs first: the forearm moves with the arm."""
     needs, chains = guide.options.joined.needs, guide.options.model.chains
-    order = sorted(needs, key=lambda name: chains[name].joints[-1:], reverse=True)
+    order = sorted(needs, key=lambda name: chains[name][-1:], reverse=True)
     if not asked_for:
         known = {name: name for name in guide.options.model.table.segments} | dict(guide.options.known) | guide.segments
         known = {name: known[name] for name in guide.monitor.sending if name in known}
