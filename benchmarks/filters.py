@@ -16,14 +16,14 @@ import numpy as np
 
 import wepose_pin as wp
 from wepose_pin.errors import how_to_install
-from wepose_pin.filters import METHODS, OFFLINE, SensorFilters, run_filter
+from wepose_pin.filters import METHODS, OFFLINE, SensorFilters
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import simulate, simulate_person
 
 from . import validation
 from .tables import Column, Section, Table, is_installed, time_in_turn
-from .trials import read_broad
+from .trials import read_broad, run_filter
 from .validation.single import simulate_paper_dynamic
 
 NO_PEERS = f"No ratios, they need VQF: {how_to_install('vqf')}."

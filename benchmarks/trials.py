@@ -10,7 +10,7 @@ what turns about other axes is 0.2 to 0.4 deg, neighbours' joint centres agree t
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +18,10 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import rotations
 from wepose_pin.data_tables import read_columns, read_table
 from wepose_pin.errors import BadData, MissingFile
+from wepose_pin.filters import BEST, Orientation, SensorFilters
+from wepose_pin.filters.noise import SensorNoise
 from wepose_pin.readers.arrays import read_mat
+from wepose_pin.recording import ImuSensor, Recording
 
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
 RING = Path("ring") / "trial1"
@@ -217,3 +220,11 @@ def read_ur5(data: Path, recording: str, sensor: str) -> Referenced:
     turned = np.flatnonzero((R_VB[0].inv() * R_VB).magnitude() > np.deg2rad(0.3))
     static = slice(0, max(0, int(turned[0]) - round(0.1 * rate_hz)) if len(turned) else len(time))
     return Referenced(f"{recording} {sensor}", rate_hz, gyro, accel, time - time[0], quat_VB, static)
+
+
+def run_filter(
+    gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise, method: str = BEST, params: Any = None
+) -> Orientation:
+    """Return the orientations of one sensor, of checked arrays and known noise, from the first sample on."""
+    recording = Recording("", np.empty(len(gyro_S)), rate_hz, {"": ImuSensor(gyro_S, accel_S)})
+    return SensorFilters({"": noise}, method=method, params=params).push(recording)[""]

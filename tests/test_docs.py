@@ -165,11 +165,15 @@ def test_the_filter_of_the_recipe_follows_a_tilt(tmp_path: Path) -> None:
     accel = np.tile(Rotation.from_rotvec([0.5, 0.0, 0.0]).inv().apply([0.0, 0.0, 9.8]), (2000, 1))
     gyro, static = np.tile(TYPICAL.gyro_bias, (2000, 1)), np.zeros(2000, dtype=bool)
     start = np.array([0.0, 0.0, 0.0, 1.0])
-    run = module.Levelled(TYPICAL, 100.0, start).run(gyro, accel, static)
-    filter_ = module.Levelled(TYPICAL, 100.0, start)
-    single = [filter_.run(g, a, False).quat_VS[0] for g, a in zip(gyro, accel, strict=True)]
-    np.testing.assert_array_equal(single, run.quat_VS)
-    np.testing.assert_allclose(Rotation.from_quat(run.quat_VS[-1]).as_rotvec(), [0.5, 0.0, 0.0], atol=2e-3)
+    runs = []
+    for size in (1, len(gyro)):
+        records = module.LEVELLED.make_records(TYPICAL, 100.0, start, module.LevelledParams())
+        quat, bias = np.empty((len(gyro), 4)), np.empty_like(gyro)
+        for rows in (slice(k, k + size) for k in range(0, len(gyro), size)):
+            module.LEVELLED.run(*records, gyro[rows], accel[rows], static[rows], quat[rows], bias[rows])
+        runs.append(quat)
+    np.testing.assert_array_equal(*runs)
+    np.testing.assert_allclose(Rotation.from_quat(runs[0][-1]).as_rotvec(), [0.5, 0.0, 0.0], atol=2e-3)
 
 
 def test_the_description_of_the_recipe_is_read(tmp_path: Path) -> None:

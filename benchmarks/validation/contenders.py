@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wepose_pin import rotations
-from wepose_pin.filters import METHODS, GdcParams, NcfParams, run_filter
+from wepose_pin.filters import METHODS, GdcParams, NcfParams
 from wepose_pin.filters.noise import SensorNoise
 from wepose_pin.filters.static import StaticTest
 
+from ..trials import run_filter
 from .gains import make_gains
 
 OURS = "smekf"  # the paper's filter

@@ -41,7 +41,7 @@ from ..body.subject import Subject, girdle_rows, population_subject
 from ..body.table import check_segments
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
-from ..filters.sensors import filter_recording
+from ..filters.sensors import start_filters
 from ..recording import Recording
 from .equations import Layout
 from .paper import Formulation, solve_paper_calibration
@@ -143,7 +143,7 @@ def calibrate(
     prior = prior or population_subject(stature, sex, model)
     prior.check_body(model.table)
     lengths = convert_breadths(measured or {}, model.table, measured_std)
-    filtered = filter_recording(recording, method=method, sways=not model.table.is_mechanism)
+    _, filtered = start_filters(recording, method=method, sways=not model.table.is_mechanism)
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:  # the two calibrations are fused, each on the population prior
         prior = separate_mounts(earlier, population_subject(body=model))

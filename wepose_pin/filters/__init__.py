@@ -20,15 +20,7 @@ from .amekf import AmekfParams
 from .base import Orientation, join_orientations
 from .complementary import GdcParams, NcfParams
 from .noise import TYPICAL, SensorNoise, estimate_noise
-from .sensors import (
-    BEST,
-    METHODS,
-    OFFLINE,
-    STATIC_ONLY,
-    SensorFilters,
-    check_method,
-    run_filter,
-)
+from .sensors import BEST, METHODS, OFFLINE, STATIC_ONLY, SensorFilters, check_method
 from .smekf import SmekfParams
 from .static import StaticTest
 
@@ -47,7 +39,6 @@ __all__ = [
     "check_method",
     "estimate_orientation",
     "join_orientations",
-    "run_filter",
 ]
 
 

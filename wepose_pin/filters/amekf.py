@@ -20,9 +20,7 @@ velocity is zero and the gyroscope measures its bias.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -38,12 +36,12 @@ from .base import (
     START_HEADING_STD,
     STATIC_TURN_NOISE,
     FilterParams,
-    Orientation,
     OrientationFilter,
     bridge_rate,
     into_sensor,
     make_record,
 )
+from .noise import SensorNoise
 
 
 class ErrorStates(NamedTuple):
@@ -282,7 +280,7 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
+def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]. Return whether a block ended."""
     dt, x, R, block, bias = model.dt, state.x, state.R_VS, state.block, state.gyro_bias
     moving, began = 0.0 if static else 1.0, 1.0 if state.samples else 0.0
@@ -334,13 +332,14 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
 
 
 @kernel
-def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
+def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
+    """Filter samples as `OrientationFilter.run`; of each block that ends fill one of `blocks`, while there are any."""
     state, model = states[0], models[0]
     P, row = state.P, 0
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        if step(state, model, gx, gy, gz, ax, ay, az, static[k]) and row < len(blocks):
+        if _step(state, model, gx, gy, gz, ax, ay, az, static[k]) and row < len(blocks):
             for n in range(len(SMOOTHED_STATES)):
                 for j in range(STATES):
                     state.block.P_smoothed_rows[n, j] = state.P[SMOOTHED_STATES[n], j]
@@ -354,88 +353,82 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
             out_bias[k, i], out_vertical[k, i] = state.gyro_bias[i], state.about_vertical[i]
 
 
-class Amekf(OrientationFilter):
-    """aMEKF of one sensor.
+def make_records(
+    noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: AmekfParams | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the state and the constants of an aMEKF."""
+    p = params or AmekfParams()
+    x, std, P = np.zeros(STATES), np.zeros(STATES), np.zeros((STATES, COLUMNS))
+    x[ERROR.gyro_bias] = noise.gyro_bias
+    std[ERROR.attitude] = p.tilt_std, p.tilt_std, START_HEADING_STD
+    std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
+    std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
+    std[ERROR.motion_bias] = p.motion_bias_std
+    np.fill_diagonal(P, std**2)
+    P[ERROR.gyro_bias, ERROR.gyro_bias] = noise.gyro_bias_cov
+    bias_var = float(np.trace(noise.gyro_bias_cov)) / 3.0
+    state = make_record(
+        quat_VS=quat_VS,  # (4,) xyzw
+        gyro_bias=noise.gyro_bias,  # [rad/s] as returned: with the motion bias where the sample is not static
+        x=x,  # (25,) as `ErrorStates`; the attitude's error is always zero
+        P=P,  # (25, 32)
+        about_vertical=np.array([0.0, 0.0, bias_var + p.motion_bias_std**2]),  # as `Orientation`
+        last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
+        lost_s=0.0,  # [s] the same
+        # sums over the samples of the open block
+        samples=np.int64(0),
+        static_samples=np.int64(0),
+        gyro_sum=np.zeros(3),  # [rad/s]
+        rate_squared=0.0,  # [rad²/s²]
+        acceleration_sum=0.0,  # [m/s²] magnitude
+        impact_excess=0.0,  # [m/s²] magnitude beyond the limit of an impact
+        lost_rotation_var=0.0,  # [rad²]
+        lost_accel_s=0.0,  # [s]
+        block=np.zeros((), BLOCK),
+        # work space
+        R_VS=np.zeros((3, 3)),
+        FP_rows=np.zeros((PROPAGATED_STATES, COLUMNS)),
+        FP_columns=np.zeros((STATES, 8)),  # the last column is zero
+        FPF_corner=np.zeros((PROPAGATED_STATES, 8)),
+        gains=np.zeros((3, COLUMNS)),  # P h/√s of the measurements that are taken together
+        measured=np.zeros(3),
+        innovation=np.zeros(3),
+    )
+    block_samples = max(1, round(p.block_s * rate_hz))
+    length = block_samples / rate_hz
+    gyro_var, accel_var = float(np.trace(noise.gyro_cov)) / 3.0, float(np.trace(noise.accel_cov)) / 3.0
+    noise_psd = np.zeros(STATES)
+    noise_psd[ERROR.attitude], noise_psd[ERROR.velocity] = (
+        gyro_var / rate_hz,
+        accel_var * noise.gravity**2 / rate_hz,
+    )
+    noise_psd[ERROR.gyro_bias], noise_psd[ERROR.gyro_matrix] = p.gyro_bias_walk**2, p.gyro_matrix_walk**2
+    noise_psd[ERROR.accel_bias], noise_psd[ERROR.motion_bias] = p.accel_bias_walk**2, p.motion_bias_walk**2
+    # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
+    white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
+    model = make_record(
+        dt=1.0 / rate_hz,  # [s]
+        block_samples=np.int64(block_samples),
+        gravity=noise.gravity,  # [m/s²]
+        noise_psd=noise_psd,  # (25,) by which the variance of each state grows in a second
+        velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
+        position_var=p.position_std**2 * p.motion_s / length,  # [m²]
+        static_velocity_var=p.static_speed_std**2,  # [m²/s²]
+        static_bias_var=p.static_bias_std**2 + white + sway / length,  # [rad²/s²] of gyro's mean about the bias
+        # [rad²/s] A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
+        static_heading_psd=p.static_turn_noise**2 + sway / 8.0,
+        rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
+        force_error_var=p.force_noise**2,  # [1] of the summed |acceleration| of a block
+        lost_accel_var=p.lost_force_std**2,  # [m²/s⁴]
+        gyro_range=p.gyro_range,  # [rad/s]
+        impact_limit=p.impact,  # [m/s²]
+    )
+    return state, model
 
-    Over a lost sample of gyro the last rate is held and fades, and the attitude's covariance grows by what may have
-    been missed (`base.HOLD_S`), as at a sample beyond the range in `params`. A lost sample of accel counts as gravity
-    alone, and the velocity's covariance grows. An impact (`AmekfParams.impact`) increases it too. A jump of the bias is
-    adopted in the next static phase; until then the tilt error reaches some degrees. Without a static phase everything
-    is estimated in motion: the tilt in ten seconds, the other parameters in about a minute. Time is not an input:
-    readers bridge gaps and remove duplicates. A run fills one of `blocks`, an array of `BLOCK`, at the end of each.
-    """
 
-    params_type, blocks = AmekfParams, np.empty(0, BLOCK)
-
-    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        noise, p, rate_hz = self.noise, self.params, self.rate_hz
-        x, std, P = np.zeros(STATES), np.zeros(STATES), np.zeros((STATES, COLUMNS))
-        x[ERROR.gyro_bias] = noise.gyro_bias
-        std[ERROR.attitude] = p.tilt_std, p.tilt_std, START_HEADING_STD
-        std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
-        std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
-        std[ERROR.motion_bias] = p.motion_bias_std
-        np.fill_diagonal(P, std**2)
-        P[ERROR.gyro_bias, ERROR.gyro_bias] = noise.gyro_bias_cov
-        bias_var = float(np.trace(noise.gyro_bias_cov)) / 3.0
-        state = make_record(
-            quat_VS=quat_VS,  # (4,) xyzw
-            gyro_bias=noise.gyro_bias,  # [rad/s] as returned: with the motion bias where the sample is not static
-            x=x,  # (25,) as `ErrorStates`; the attitude's error is always zero
-            P=P,  # (25, 32)
-            about_vertical=np.array([0.0, 0.0, bias_var + p.motion_bias_std**2]),  # as `Orientation`
-            last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
-            lost_s=0.0,  # [s] the same
-            # sums over the samples of the open block
-            samples=np.int64(0),
-            static_samples=np.int64(0),
-            gyro_sum=np.zeros(3),  # [rad/s]
-            rate_squared=0.0,  # [rad²/s²]
-            acceleration_sum=0.0,  # [m/s²] magnitude
-            impact_excess=0.0,  # [m/s²] magnitude beyond the limit of an impact
-            lost_rotation_var=0.0,  # [rad²]
-            lost_accel_s=0.0,  # [s]
-            block=np.zeros((), BLOCK),
-            # work space
-            R_VS=np.zeros((3, 3)),
-            FP_rows=np.zeros((PROPAGATED_STATES, COLUMNS)),
-            FP_columns=np.zeros((STATES, 8)),  # the last column is zero
-            FPF_corner=np.zeros((PROPAGATED_STATES, 8)),
-            gains=np.zeros((3, COLUMNS)),  # P h/√s of the measurements that are taken together
-            measured=np.zeros(3),
-            innovation=np.zeros(3),
-        )
-        block_samples = max(1, round(p.block_s * rate_hz))
-        length = block_samples / rate_hz
-        gyro_var, accel_var = float(np.trace(noise.gyro_cov)) / 3.0, float(np.trace(noise.accel_cov)) / 3.0
-        noise_psd = np.zeros(STATES)
-        noise_psd[ERROR.attitude], noise_psd[ERROR.velocity] = (
-            gyro_var / rate_hz,
-            accel_var * noise.gravity**2 / rate_hz,
-        )
-        noise_psd[ERROR.gyro_bias], noise_psd[ERROR.gyro_matrix] = p.gyro_bias_walk**2, p.gyro_matrix_walk**2
-        noise_psd[ERROR.accel_bias], noise_psd[ERROR.motion_bias] = p.accel_bias_walk**2, p.motion_bias_walk**2
-        # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
-        white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
-        model = make_record(
-            dt=1.0 / rate_hz,  # [s]
-            block_samples=np.int64(block_samples),
-            gravity=noise.gravity,  # [m/s²]
-            noise_psd=noise_psd,  # (25,) by which the variance of each state grows in a second
-            velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
-            position_var=p.position_std**2 * p.motion_s / length,  # [m²]
-            static_velocity_var=p.static_speed_std**2,  # [m²/s²]
-            static_bias_var=p.static_bias_std**2 + white + sway / length,  # [rad²/s²] of gyro's mean about the bias
-            # [rad²/s] A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
-            static_heading_psd=p.static_turn_noise**2 + sway / 8.0,
-            rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
-            force_error_var=p.force_noise**2,  # [1] of the summed |acceleration| of a block
-            lost_accel_var=p.lost_force_std**2,  # [m²/s⁴]
-            gyro_range=p.gyro_range,  # [rad/s]
-            impact_limit=p.impact,  # [m/s²]
-        )
-        return state, model
-
-    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
-        arrays = out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical
-        return partial(_run, self.state, self.model, gyro_S, accel_S, out.static, self.blocks, *arrays)
+# While gyro is lost the last rate is held and fades, and the attitude's covariance grows by what may have been missed
+# (`base.HOLD_S`), as at a sample beyond the range in `params`. A lost sample of accel counts as gravity alone, and the
+# velocity's covariance grows. An impact (`AmekfParams.impact`) increases it too. A jump of the bias is adopted in the
+# next static phase; until then the tilt error reaches some degrees. Without a static phase everything is estimated in
+# motion: the tilt in ten seconds, the other parameters in about a minute.
+AMEKF = OrientationFilter(lambda *of_sensor: (*make_records(*of_sensor), np.empty(0, BLOCK)), run, AmekfParams)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from ..arguments import check_fields
 from ..compilation import inlined
 from ..diagnostics import Diagnostic, notebook_html
-from ..errors import BadData
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from .noise import SensorNoise
 
@@ -103,14 +102,13 @@ def make_record(**values: Any) -> np.ndarray:
 
     A step is compiled for the types of the record, and a parameter may be stated as an integer.
     """
-    fields = (
-        (name, value.dtype if isinstance(value, np.generic | np.ndarray) else float, np.shape(value))
-        for name, value in values.items()
+    dtype = _make_dtype(
+        *(
+            (name, value.dtype if isinstance(value, np.generic | np.ndarray) else float, np.shape(value))
+            for name, value in values.items()
+        )
     )
-    record = np.zeros(1, _make_dtype(*fields))
-    for name, value in values.items():
-        record[name] = value
-    return record
+    return np.array([tuple(values.values())], dtype)
 
 
 @cache
@@ -126,52 +124,25 @@ class FilterParams:
         check_fields(self, "")
 
 
-class OrientationFilter:
-    """A filter made for one sensor: ``Filter(noise, rate_hz, quat_VS, params)``.
+class OrientationFilter(NamedTuple):
+    """A filter of one sensor, whose state and constants are records (1,) of a compiled step.
 
-    V is the sensor's own world: z up, heading of the `quat_VS` from which the filter starts. A run, the same run cut
-    in two, and a run sample by sample are bit-identical. A sample that is no number was lost.
+    V is the sensor's own world: z up, heading of the `quat_VS` from which the filter starts. A run, the same run cut in
+    two, and a run sample by sample are bit-identical. A sample that is no number was lost.
 
-    Attributes
+    Parameters
     ----------
-    state, model : records (1,) of the compiled step: what changes with a sample, and constants
+    make_records : noise, rate_hz, quat_VS (4,), params → the records
+    run : takes the records, samples `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²], `static` (n,) bool, and the
+        arrays `quat_VS`, `gyro_bias` and with a covariance `attitude_cov`, `about_vertical` of an `Orientation`, which
+        it fills; all arrays are contiguous
+    params_type : of its parameters, if it has any
     """
 
+    make_records: Callable[[SensorNoise, float, np.ndarray, Any], tuple[np.ndarray, ...]]
+    run: Callable[..., None]
     params_type: type | None = None
-    has_covariance = True
-    # compiled: state, model, gyro_S, accel_S, static, and the arrays quat_VS, gyro_bias and with a covariance
-    # attitude_cov, about_vertical of an `Orientation`, to be filled
-    _run: Callable[..., None]
-
-    def __init__(self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: Any = None) -> None:
-        self.params = self.params_type() if params is None and self.params_type else params
-        self.noise, self.rate_hz = noise, rate_hz
-        self.state, self.model = self._make_records(np.asarray(quat_VS, dtype=float))
-
-    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        raise NotImplementedError
-
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> Orientation:
-        """Take samples, `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²], `static` (n,) bool, or one without the n.
-
-        The state continues from the run before.
-        """
-        gyro, accel = as_rows(gyro_S), as_rows(accel_S)
-        counts = len(gyro), len(accel), np.size(static)
-        if min(counts) < max(counts):  # the compiled steps would read beyond an array's end
-            raise BadData("{} rows of gyro_S, {} of accel_S, {} of static: they must be as many".format(*counts))
-        out = make_orientation(len(gyro), self.noise, covariance=self.has_covariance)
-        out.static[:] = static
-        self.bind(gyro, accel, out)()
-        return out
-
-    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
-        """Return a call that takes the samples then in these arrays and in `out.static`, and fills the rest of `out`.
-
-        The arrays are contiguous, as `as_rows` returns them.
-        """
-        arrays = (out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical)[: 4 if self.has_covariance else 2]
-        return partial(self._run, self.state, self.model, gyro_S, accel_S, out.static, *arrays)
+    has_covariance: bool = True
 
 
 def as_rows(values: np.ndarray) -> np.ndarray:

@@ -27,6 +27,19 @@ def band_pass(values: np.ndarray, band_hz: tuple[float, float], rate_hz: float) 
     return _filter_both_ways(_design(band_hz, rate_hz), values)
 
 
+def settle_band_pass(band_hz: tuple[float, float], rate_hz: float, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a band-pass for `filter_chunk`, in the state after a long time of the signals `first` (c,)."""
+    sections = _design(band_hz, rate_hz)
+    return sections, _find_settled_state(sections, first)
+
+
+def filter_chunk(sections: np.ndarray, state: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return a filtered chunk (n, c) of signals; `state` is then that after it."""
+    signals = np.array(values, dtype=float)
+    _filter(sections, state, signals)
+    return signals
+
+
 def _design(band_hz: tuple[float | None, float], rate_hz: float) -> np.ndarray:
     """Sections (k, 6) b0, b1, b2, 1, a1, a2, by the bilinear transform at a rate of 2 of warped frequencies."""
     low, high = (0.0 if f is None else 4.0 * float(np.tan(np.pi * f / rate_hz)) for f in band_hz)
@@ -77,17 +90,3 @@ def _filter(sections: np.ndarray, state: np.ndarray, signals: np.ndarray) -> Non
                 state[k, c, 0] = b1 * x - a1 * y + state[k, c, 1]
                 state[k, c, 1] = b2 * x - a2 * y
                 signals[i, c] = y
-
-
-class BandPass:
-    """A band-pass filter of signals that come in chunks, from the state settled at `first` (c,)."""
-
-    def __init__(self, band_hz: tuple[float, float], rate_hz: float, first: np.ndarray) -> None:
-        self._sections = _design(band_hz, rate_hz)
-        self._state = _find_settled_state(self._sections, first)
-
-    def push(self, values: np.ndarray) -> np.ndarray:
-        """Return the filtered chunk (n, c)."""
-        signals = np.array(values, dtype=float)
-        _filter(self._sections, self._state, signals)
-        return signals

@@ -1,4 +1,4 @@
-"""Filters with fixed gains, without covariance: `Ncf` and `Gdc`. A sample that is no number is passed over.
+"""Filters with fixed gains, without covariance. A sample that is no number is passed over.
 
 NCF is the nonlinear (explicit) complementary filter with integral term (Mahony, Hamel, Pflimlin 2008, IEEE TAC 53(5)),
 equation (32) with gravity as the only measured direction: e = a × R_VSᵀ e_z with a the unit accelerometer direction,
@@ -21,6 +21,7 @@ from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import derivative, rotate_by_vector, up_in_sensor
 from .base import FilterParams, OrientationFilter, make_record
+from .noise import SensorNoise
 
 
 @dataclass(frozen=True)
@@ -99,19 +100,13 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias):  # type: 
             out_bias[k, i] = state.gyro_bias[i]
 
 
-class Ncf(OrientationFilter):
-    """NCF of one sensor; the bias starts at the static phase's mean."""
-
-    params_type: type | None = NcfParams
-    has_covariance, _run = False, staticmethod(_run)
-
-    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        gains = {"proportional": 0.0, "integral": 0.0, "gain": 0.0} | vars(self.params)
-        state = make_record(quat_VS=quat_VS, gyro_bias=self.noise.gyro_bias)
-        return state, make_record(dt=1.0 / self.rate_hz, **gains)
+def _make_records(
+    noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: NcfParams | GdcParams
+) -> tuple[np.ndarray, ...]:
+    gains = {"proportional": 0.0, "integral": 0.0, "gain": 0.0} | vars(params)
+    state = make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias)  # the bias starts at the static phase's mean
+    return state, make_record(dt=1.0 / rate_hz, **gains)
 
 
-class Gdc(Ncf):
-    """GDC of one sensor; the bias is the static phase's mean."""
-
-    params_type = GdcParams
+NCF = OrientationFilter(_make_records, _run, NcfParams, has_covariance=False)
+GDC = OrientationFilter(_make_records, _run, GdcParams, has_covariance=False)

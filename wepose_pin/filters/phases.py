@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
@@ -35,21 +34,20 @@ BEGINNING_S = 20.0
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
-class ReferencePhases(NamedTuple):
-    """From what filters and headings start."""
-
-    start: tuple[float, float]  # [s] of the start pose
-    static: tuple[float, float]  # [s] of noise and bias
-    noises: dict[str, SensorNoise]  # segment → noise of its sensor; none of measured orientations
-    diagnostics: list[Diagnostic]  # of the recording, and of these
-
-
-def find_reference_phases(recording: Recording, sways: bool = True) -> ReferencePhases:
+def find_reference_phases(
+    recording: Recording, sways: bool
+) -> tuple[tuple[float, float], tuple[float, float], dict[str, SensorNoise], list[Diagnostic]]:
     """Find the start pose and each sensor's noise and bias, and check that nothing moves there.
 
     Parameters
     ----------
     sways : whether a person stands in the start pose; a mechanism stands still
+
+    Returns
+    -------
+    start, static : [s] the start pose, and the phase of noise and bias
+    noises : segment → noise of its sensor; none of measured orientations
+    diagnostics : of the recording, and of these phases
 
     Raises
     ------
@@ -92,7 +90,7 @@ def find_reference_phases(recording: Recording, sways: bool = True) -> Reference
             except WeposeError as error:
                 raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
     diagnostics += _check_common_rotation(recording, noises, static)
-    return ReferencePhases(start, static, noises, diagnostics)
+    return start, static, noises, diagnostics
 
 
 def _check_samples(recording: Recording, interval: tuple[float, float], phase: str) -> None:

@@ -14,6 +14,7 @@ from ..compilation import compiled
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, up_in_sensor
 from .base import HEADING, RATE, RATE_VAR, OrientationFilter, make_record
+from .noise import SensorNoise
 
 START_VAR = 1e-3  # [rad²], [rad²/s²] P₀ of the authors' software
 
@@ -52,18 +53,14 @@ def _fill_cross(A, v, diagonal):  # type: ignore[no-untyped-def]
     A[1, 2], A[2, 0], A[2, 1] = -v[0], -v[1], v[0]
 
 
-class PublishedSmekf(OrientationFilter):
-    """sMEKF of one sensor, with the covariances of the authors' software. A sample that is no number is passed over.
+def _make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: None) -> tuple[np.ndarray, ...]:  # noqa: ARG001
+    Q, R = np.zeros((6, 6)), np.zeros((6, 6))
+    Q[:3, :3], Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov  # of [w_ω; w_b]
+    R[:3, :3], R[3:, 3:] = noise.accel_cov, noise.gyro_cov  # of [w_g; w_ω]
+    P = START_VAR * np.eye(6)
+    state = make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias, P=P, about_vertical=np.zeros(3))
+    return state, make_record(dt=1.0 / rate_hz, gravity=noise.gravity, Q=Q, R=R)
 
-    `sensors.SensorFilters` gives it the paper's static test too.
-    """
 
-    _run = staticmethod(_run)
-
-    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        noise, Q, R = self.noise, np.zeros((6, 6)), np.zeros((6, 6))
-        Q[:3, :3], Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov  # of [w_ω; w_b]
-        R[:3, :3], R[3:, 3:] = noise.accel_cov, noise.gyro_cov  # of [w_g; w_ω]
-        P = START_VAR * np.eye(6)
-        state = make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias, P=P, about_vertical=np.zeros(3))
-        return state, make_record(dt=1.0 / self.rate_hz, gravity=noise.gravity, Q=Q, R=R)
+# With the covariances of the authors' software, and in `sensors` with the paper's static test.
+PUBLISHED_SMEKF = OrientationFilter(_make_records, _run)

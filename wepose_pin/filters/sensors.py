@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,23 +15,23 @@ from .. import rotations
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
-from .amekf import Amekf, AmekfParams
+from .amekf import AMEKF, AmekfParams
 from .base import Orientation, OrientationFilter, as_rows, count_processors, make_orientation
-from .complementary import Gdc, Ncf
+from .complementary import GDC, NCF
 from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
 from .phases import find_reference_phases
-from .published import PublishedSmekf
-from .smekf import Smekf, SmekfParams
-from .smoother import Smoother
-from .static import USUAL_TEST, StaticDetector, StaticTest
+from .published import PUBLISHED_SMEKF
+from .smekf import SMEKF, SmekfParams
+from .smoother import SMOOTHER
+from .static import USUAL_TEST, StaticTest, find_static, make_static_records
 
-METHODS: dict[str, type[OrientationFilter]] = {
-    "amekf": Amekf,
-    "smoother": Smoother,
-    "smekf": Smekf,
-    "smekf_published": PublishedSmekf,
-    "ncf": Ncf,
-    "gdc": Gdc,
+METHODS: dict[str, OrientationFilter] = {
+    "amekf": AMEKF,
+    "smoother": SMOOTHER,
+    "smekf": SMEKF,
+    "smekf_published": PUBLISHED_SMEKF,
+    "ncf": NCF,
+    "gdc": GDC,
 }
 BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
@@ -43,6 +43,24 @@ def check_method(method: str) -> str:
     if method not in METHODS:
         raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
     return method
+
+
+# Binds a filter and its static test to samples (n, 3) and to an `Orientation` that their calls fill.
+_Bind = Callable[[np.ndarray, np.ndarray, Orientation], list[Callable[[], None]]]
+
+
+def _start_filter(
+    filter_: OrientationFilter, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: Any, test: StaticTest
+) -> _Bind:
+    static_records = make_static_records(noise, rate_hz, test)
+    records = filter_.make_records(noise, rate_hz, quat_VS, params)
+
+    def bind(gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> list[Callable[[], None]]:
+        samples, covariances = (gyro_S, accel_S, out.static), (out.attitude_cov, out.about_vertical)
+        filled = (out.quat_VS, out.gyro_bias, *(covariances if filter_.has_covariance else ()))
+        return [partial(find_static, *static_records, *samples), partial(filter_.run, *records, *samples, *filled)]
+
+    return bind
 
 
 class SensorFilters:
@@ -83,11 +101,10 @@ class SensorFilters:
     ) -> None:
         self._method, self._params, self._start = check_method(method), params, start
         self._test = static_test or USUAL_TEST
-        if METHODS[method] is PublishedSmekf:
+        if METHODS[method] is PUBLISHED_SMEKF:
             self._test = replace(self._test, rate_stds=np.inf)
         self.names, self._noises = tuple(noises), dict(noises)
-        self._filters: dict[str, OrientationFilter] = {}
-        self._detectors: dict[str, StaticDetector] = {}
+        self._filters: dict[str, _Bind] = {}
         k = len(self.names)
         self._now = make_orientation(k, TYPICAL, covariance=METHODS[method].has_covariance)
         self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
@@ -135,8 +152,7 @@ class SensorFilters:
         calls: list[Callable[[], None]] = []
         for i, name in enumerate(self.names):
             gyro_S, accel_S, now = self._gyro_S[i : i + 1], self._accel_S[i : i + 1], self._now.take(slice(i, i + 1))
-            calls.append(self._detectors[name].bind(gyro_S, accel_S, now.static))
-            calls.append(self._filters[name].bind(gyro_S, accel_S, now))
+            calls += self._filters[name](gyro_S, accel_S, now)
         return calls
 
     def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
@@ -145,15 +161,14 @@ class SensorFilters:
         if sensor.gap is not None:
             # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
             gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
-        kind, begin, cov = METHODS[self._method], 0, None
-        out = make_orientation(len(gyro_S), self._noises[name], covariance=kind.has_covariance)
+        begin, cov = 0, None
+        out = make_orientation(len(gyro_S), self._noises[name], covariance=METHODS[self._method].has_covariance)
         if name not in self._filters:
             begin = self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range, out)
         if self._method in OFFLINE and out.attitude_cov is not None:  # forward over all samples
             begin, cov = 0, out.attitude_cov[:begin].copy()
-        rest = out.take(slice(begin, None))
-        self._detectors[name].bind(gyro_S[begin:], accel_S[begin:], rest.static)()
-        self._filters[name].bind(gyro_S[begin:], accel_S[begin:], rest)()
+        for call in self._filters[name](gyro_S[begin:], accel_S[begin:], out.take(slice(begin, None))):
+            call()
         if cov is not None and out.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
             out.attitude_cov[: len(cov)] = cov
@@ -162,27 +177,30 @@ class SensorFilters:
     def _begin(
         self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float, out: Orientation
     ) -> int:
-        """Create the filter; fill `out` before its first sample by filtering backward, and return that sample."""
+        """Start the filter; fill `out` before its first sample by filtering backward, and return that sample."""
         noise, phase = self._noises[name], self._start or slice(0, self._test.samples(rate_hz))
         quat_VS, tilt_std = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
         if self._start is None:  # the sensor may move there
             tilt_std = MOVING_TILT_STD
-        first = phase.start
+        first = int(phase.start)
 
-        def create(method: str, noise: SensorNoise, quat_VS: np.ndarray) -> OrientationFilter:
-            params, params_type = self._params, METHODS[method].params_type
-            if params_type in (AmekfParams, SmekfParams):
-                params = params or params_type(tilt_std=tilt_std)
-                params = replace(params, gyro_range=min(gyro_range, params.gyro_range))
-            return METHODS[method](noise, rate_hz, quat_VS, params)
+        def start(method: str, noise: SensorNoise, quat_VS: np.ndarray) -> _Bind:
+            filter_, params = METHODS[method], self._params
+            if filter_.params_type in (AmekfParams, SmekfParams):
+                params = params or filter_.params_type(tilt_std=tilt_std)
+                params = replace(params, gyro_range=gyro_range) if gyro_range < params.gyro_range else params
+            elif params is None and filter_.params_type is not None:
+                params = filter_.params_type()
+            return _start_filter(filter_, noise, rate_hz, quat_VS, params, self._test)
 
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
             turn = np.nan_to_num(gyro_S[first] - noise.gyro_bias) / rate_hz
             mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
             gyro, accel = as_rows(-gyro_S[first:0:-1]), as_rows(accel_S[first - 1 :: -1])
-            static = StaticDetector(mirrored, rate_hz, self._test).run(gyro, accel)
             method = BEST if self._method in OFFLINE else self._method
-            run = create(method, mirrored, rotations.turned(quat_VS, turn)).run(gyro, accel, static)
+            run = make_orientation(first, mirrored, covariance=METHODS[method].has_covariance)
+            for call in start(method, mirrored, rotations.turned(quat_VS, turn))(gyro, accel, run):
+                call()
             for field, values in run.sampled().items():
                 getattr(out, field)[:first] = values[::-1]
             out.gyro_bias[:first] *= -1.0
@@ -191,24 +209,8 @@ class SensorFilters:
             if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
                 turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
                 quat_VS, tilt_std = rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD
-        self._filters[name] = create(self._method, noise, quat_VS)
-        self._detectors[name] = StaticDetector(noise, rate_hz, self._test)
-        return int(first)
-
-
-def run_filter(
-    gyro_S: np.ndarray,
-    accel_S: np.ndarray,
-    rate_hz: float,
-    noise: SensorNoise,
-    method: str = BEST,
-    params: Any = None,
-    *,
-    start: slice | None = None,
-) -> Orientation:
-    """Return the orientations of one sensor, of checked arrays and known noise; the rest as of `SensorFilters`."""
-    recording = Recording("", np.empty(len(gyro_S)), rate_hz, {"": ImuSensor(gyro_S, accel_S)})
-    return SensorFilters({"": noise}, method=method, params=params, start=start).push(recording)[""]
+        self._filters[name] = start(self._method, noise, quat_VS)
+        return first
 
 
 class FilteredRecording(NamedTuple):
@@ -217,22 +219,15 @@ class FilteredRecording(NamedTuple):
     R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
     R_VS_start: dict[str, Rotation]  # their mean in the start pose
     orientation: dict[str, Orientation]  # the filter's result; none for measured orientations
-    start: tuple[float, float]  # [s]
-    static_phase: tuple[float, float]  # [s]
+    start: tuple[float, float]  # [s] of the start pose
+    static_phase: tuple[float, float]  # [s] of noise and bias
     diagnostics: list[Diagnostic]  # of the recording, and of its start pose
-
-
-def filter_recording(
-    recording: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
-) -> FilteredRecording:
-    """Filter every sensor, and check that the start pose is static; parameters and errors as of `start_filters`."""
-    return start_filters(recording, method=method, static_test=static_test, sways=sways)[1]
 
 
 def start_filters(
     first: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
 ) -> tuple[SensorFilters, FilteredRecording]:
-    """Filter the first chunk of a recording, which contains the start pose; the filters take the next ones.
+    """Filter a recording, or the first chunk of one, with the start pose; the filters take the next chunks.
 
     Parameters
     ----------
@@ -243,12 +238,11 @@ def start_filters(
     WeposeError
         A start phase with too few samples, or with motion; an unknown method.
     """
-    phases = find_reference_phases(first, sways)
-    span = first.span(phases.start)
-    filters = SensorFilters(phases.noises, method=method, static_test=static_test, start=span)
+    start, static, noises, diagnostics = find_reference_phases(first, sways)
+    filters = SensorFilters(noises, method=method, static_test=static_test, start=first.span(start))
     orientation, R_VS, R_VS_start = filters.push(first), {}, {}
     for segment, sensor in first.sensors.items():
         quat_VS = (sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_VS
         R_VS[segment] = Rotation.from_quat(quat_VS)
-        R_VS_start[segment] = R_VS[segment][first.find_measured(segment, phases.start)].mean()
-    return filters, FilteredRecording(R_VS, R_VS_start, orientation, phases.start, phases.static, phases.diagnostics)
+        R_VS_start[segment] = R_VS[segment][first.find_measured(segment, start)].mean()
+    return filters, FilteredRecording(R_VS, R_VS_start, orientation, start, static, diagnostics)

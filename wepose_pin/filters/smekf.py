@@ -37,7 +37,7 @@ from .base import (
     into_sensor,
     make_record,
 )
-from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S
+from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
 
 
 @dataclass(frozen=True)
@@ -170,42 +170,39 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         P[0, i], P[1, i], P[2, i] = A[i], C[i], B[i]
 
 
-class Smekf(OrientationFilter):
-    """sMEKF of one sensor. Noise, the first bias and the size of gravity come from `noise`.
+def _make_records(
+    noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: SmekfParams | None
+) -> tuple[np.ndarray, ...]:
+    p = params or SmekfParams()
+    P = np.zeros((3, 9))
+    P[0, [0, 4, 8]] = np.square([p.tilt_std, p.tilt_std, START_HEADING_STD])
+    P[2] = noise.gyro_bias_cov.ravel()
+    state = make_record(
+        quat_VS=quat_VS,  # (4,) xyzw
+        gyro_bias=noise.gyro_bias,  # (3,) [rad/s]
+        P=P,  # A, C, B of a in V [rad] and b in S [rad/s]
+        turned=0.0,  # [rad] net rotation about the vertical since the start
+        last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
+        lost_s=0.0,  # [s] the same
+        about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
+        R_VS=np.zeros((3, 3)),
+    )
+    gyro_var, accel_var, step_var = (
+        float(np.trace(cov)) / 3.0 for cov in (noise.gyro_cov, noise.accel_cov, noise.bias_step_cov)
+    )
+    model = make_record(
+        dt=1.0 / rate_hz,  # [s]
+        inverse_gravity=1.0 / noise.gravity,  # [s²/m]
+        attitude_var=gyro_var / rate_hz**2,  # [rad²] of a sample
+        bias_var=step_var / rate_hz**2,  # [rad²/s²] of a sample
+        static_gyro_var=gyro_var + noise.sway_density(rate_hz) * rate_hz,  # [rad²/s²]
+        static_accel_var=accel_var + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz,  # [1]
+        static_turn_var=p.static_turn_noise**2 / rate_hz,  # [rad²] of a sample
+        scale_var=p.gyro_scale_std**2,
+        gyro_range=p.gyro_range,  # [rad/s]
+    )
+    return state, model
 
-    While gyro is lost, its last rate is held and fades, and `attitude_cov` grows by the motion that may have been
-    missed (`base.HOLD_S`, `base.LOST_RATE_STD`).
-    """
 
-    params_type, _run = SmekfParams, staticmethod(_run)
-
-    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        noise, p, rate_hz = self.noise, self.params, self.rate_hz
-        P = np.zeros((3, 9))
-        P[0, [0, 4, 8]] = np.square([p.tilt_std, p.tilt_std, START_HEADING_STD])
-        P[2] = noise.gyro_bias_cov.ravel()
-        state = make_record(
-            quat_VS=quat_VS,  # (4,) xyzw
-            gyro_bias=noise.gyro_bias,  # (3,) [rad/s]
-            P=P,  # A, C, B of a in V [rad] and b in S [rad/s]
-            turned=0.0,  # [rad] net rotation about the vertical since the start
-            last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
-            lost_s=0.0,  # [s] the same
-            about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
-            R_VS=np.zeros((3, 3)),
-        )
-        gyro_var, accel_var, step_var = (
-            float(np.trace(cov)) / 3.0 for cov in (noise.gyro_cov, noise.accel_cov, noise.bias_step_cov)
-        )
-        model = make_record(
-            dt=1.0 / rate_hz,  # [s]
-            inverse_gravity=1.0 / noise.gravity,  # [s²/m]
-            attitude_var=gyro_var / rate_hz**2,  # [rad²] of a sample
-            bias_var=step_var / rate_hz**2,  # [rad²/s²] of a sample
-            static_gyro_var=gyro_var + noise.sway_density(rate_hz) * rate_hz,  # [rad²/s²]
-            static_accel_var=accel_var + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz,  # [1]
-            static_turn_var=p.static_turn_noise**2 / rate_hz,  # [rad²] of a sample
-            scale_var=p.gyro_scale_std**2,
-            gyro_range=p.gyro_range,  # [rad/s]
-        )
-        return state, model
+# While gyro is lost, its last rate is held and fades, and `attitude_cov` grows by the motion that may have been missed.
+SMEKF = OrientationFilter(_make_records, _run, SmekfParams)

@@ -13,43 +13,14 @@ corrections of both ends in proportion. Time is linear in the samples; the block
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 
 from ..compilation import compiled
 from ..rotations import fill_matrix, rotate_by_world_vector
-from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
-from .base import HEADING, RATE, RATE_VAR, Orientation, OrientationFilter, into_sensor
+from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, AmekfParams, make_records, run
+from .base import HEADING, RATE, RATE_VAR, OrientationFilter, into_sensor
 
 COUNT = len(SMOOTHED_STATES)
-
-
-class Smoother(OrientationFilter):
-    """Smoother of one sensor, for whole recordings; parameters are the aMEKF's.
-
-    What bad data does is said at `Amekf`; a stretch without gyro is bridged from both sides.
-    """
-
-    params_type = AmekfParams
-
-    def _make_records(self, quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        filter_ = Amekf(self.noise, self.rate_hz, quat_VS, self.params)
-        return filter_.state, filter_.model
-
-    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> Callable[[], None]:
-        """Return a call that smooths a whole recording; each call starts anew, so one cut in two is two recordings."""
-        return partial(self._smooth, gyro_S, accel_S, out)
-
-    def _smooth(self, gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> None:
-        amekf = Amekf(self.noise, self.rate_hz, self.state["quat_VS"][0], self.params)
-        P_rows, size = amekf.state["P"][0, list(SMOOTHED_STATES), :STATES], int(amekf.model["block_samples"][0])
-        amekf.blocks = blocks = np.empty(len(gyro_S) // size, BLOCK)
-        amekf.bind(gyro_S, accel_S, out)()
-        smoothed = _backward(blocks, P_rows, self.noise.gravity)
-        arrays = out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical
-        _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, out.static, *arrays)
 
 
 @compiled
@@ -153,3 +124,23 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, qu
             for j in range(3):
                 variance += R[2, i] * R[2, j] * bias_cov[row, 3 * i + j]
         about_vertical[k, RATE_VAR] = variance
+
+
+def _smooth(
+    states: np.ndarray,
+    models: np.ndarray,
+    gyro_S: np.ndarray,
+    accel_S: np.ndarray,
+    static: np.ndarray,
+    *out: np.ndarray,
+) -> None:
+    """Smooth a whole recording; each call starts anew, so that a recording cut in two is two recordings."""
+    P_rows, size = states["P"][0, list(SMOOTHED_STATES), :STATES], int(models["block_samples"][0])
+    blocks = np.empty(len(gyro_S) // size, BLOCK)
+    run(states.copy(), models, blocks, gyro_S, accel_S, static, *out)
+    smoothed = _backward(blocks, P_rows, float(models["gravity"][0]))
+    _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, static, *out)
+
+
+# What bad data does is said at `AMEKF`; a stretch without gyro is bridged from both sides.
+SMOOTHER = OrientationFilter(make_records, _smooth, AmekfParams)

@@ -13,9 +13,7 @@ means does not depend on the rate of sampling.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -24,7 +22,7 @@ from scipy.special import gammainc, gammaincinv
 from ..arguments import NonNegative, Range, check_fields, format_settings
 from ..compilation import inlined, kernel
 from ..errors import BadOption
-from .base import as_rows, make_record
+from .base import make_record
 from .noise import BLOCK_S, SensorNoise
 
 NEWEST_S = 0.05  # [s] of condition (6), about as long as the fastest smooth motion takes to begin
@@ -86,71 +84,49 @@ class StaticTest:
 USUAL_TEST = StaticTest()
 
 
-class StaticDetector:
-    """Decides for each sample whether the window that ends there is static.
-
-    A run cut in two gives the same answer to the last bit. Until the first window is full the answer is no, and so it
-    is while a sample that is no number lies in the window.
-
-    The cost per sample does not grow with the window: the window is the sums of the current block of N samples and
-    those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
-    and the differences summed are from a sample within the window, so that (mean − anchor)² is at most N − 1 variances
-    of the window itself: a static window is as precise after 1e8 samples of any motion as in the first second.
-    Condition (5) alone has a longer memory, the known bias.
-    """
-
-    def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
-        test = test or USUAL_TEST
-        n, newest = test.samples(rate_hz), max(1, round(NEWEST_S * rate_hz))
-        dt, window_s = 1.0 / rate_hz, n / rate_hz
-        half_second_cov = np.zeros((3, 3)) if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
-        white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
-        # (6): the inverse covariance of the change over the square of its bound, χ² of three axes as probable as of one
-        squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
-        rate_change = np.zeros((3, 3))
-        if newest < n and 0.0 < squared_bound < np.inf:
-            change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
-            rate_change = np.linalg.inv(change_cov) / squared_bound
-        self._model = make_record(
-            inverse_gravity=1.0 / noise.gravity,  # [s²/m]
-            # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
-            limits=(n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
-            norm_variance=(n - 1) * test.gamma2,
-            norm_error=test.gamma1,
-            newest=np.int64(min(newest, n)),  # (6): samples of the newest part
-            rate_change=rate_change,  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
-            # condition (5)
-            squared_stds=test.rate_stds**2,
-            window_var=max(white, sway),  # [rad²/s²] of a window's mean
-            average_var=max(white, sway) * window_s / (2.0 * AVERAGING_S),  # [rad²/s²] of the average
-            spread_var=BIAS_SPREAD**2,  # [rad²/s²]
-            walk_var=BIAS_WALK**2 * dt,  # [rad²/s²] by which the known bias ages in a sample
-            fade=min(1.0, dt / AVERAGING_S),  # share of the average that a sample replaces
-        )
-        # Arrays of their own, so that the compiled step is one for all rates of sampling
-        self._block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
-        self._tail = np.zeros((n, SUMS))  # sums of the block before, from each of its samples to its end
-        self._state = make_record(
-            samples=np.int64(0),  # in the current block
-            anchor=np.zeros(SIGNALS),  # the last sample of the block before
-            head=np.zeros(SUMS),  # sums of the current block so far, while it does not move
-            window=np.zeros(SUMS),  # sums of the window
-            moves=np.bool_(False),  # a sample of the block is too far from the anchor for any static window
-            moves_until=np.int64(n),  # of the block before, the last sample that is; `tail` begins after it
-            bias=noise.gyro_bias,  # [rad/s] the known bias of condition (5)
-            bias_var=np.trace(noise.gyro_bias_cov) / 3.0,  # [rad²/s²]
-            average_rate=0.0,  # [rad/s] about the vertical, beyond the known bias
-        )
-
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
-        static = np.empty(len(gyro_S), dtype=np.bool_)
-        self.bind(as_rows(gyro_S), as_rows(accel_S), static)()
-        return static
-
-    def bind(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray) -> Callable[[], None]:
-        """Return a call that fills `static` (n,) from the samples then in `gyro_S`, `accel_S` (n, 3), contiguous."""
-        return partial(_run, self._state, self._model, self._block, self._tail, gyro_S, accel_S, static)
+def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) -> tuple[np.ndarray, ...]:
+    """Return the state with which `find_static` begins: records (1,), and arrays as long as the window."""
+    n, newest = test.samples(rate_hz), max(1, round(NEWEST_S * rate_hz))
+    dt, window_s = 1.0 / rate_hz, n / rate_hz
+    half_second_cov = np.zeros((3, 3)) if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
+    white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
+    # (6): the inverse covariance of the change over the square of its bound, χ² of three axes as probable as of one
+    squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
+    rate_change = np.zeros((3, 3))
+    if newest < n and 0.0 < squared_bound < np.inf:
+        change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
+        rate_change = np.linalg.inv(change_cov) / squared_bound
+    model = make_record(
+        inverse_gravity=1.0 / noise.gravity,  # [s²/m]
+        # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
+        limits=(n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
+        norm_variance=(n - 1) * test.gamma2,
+        norm_error=test.gamma1,
+        newest=np.int64(min(newest, n)),  # (6): samples of the newest part
+        rate_change=rate_change,  # [s²/rad²] dᵀ M d ≤ 1 for the change d of the mean gyro; M zero: no condition
+        # condition (5)
+        squared_stds=test.rate_stds**2,
+        window_var=max(white, sway),  # [rad²/s²] of a window's mean
+        average_var=max(white, sway) * window_s / (2.0 * AVERAGING_S),  # [rad²/s²] of the average
+        spread_var=BIAS_SPREAD**2,  # [rad²/s²]
+        walk_var=BIAS_WALK**2 * dt,  # [rad²/s²] by which the known bias ages in a sample
+        fade=min(1.0, dt / AVERAGING_S),  # share of the average that a sample replaces
+    )
+    # Arrays of their own, so that the compiled step is one for all rates of sampling
+    block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
+    tail = np.zeros((n, SUMS))  # sums of the block before, from each of its samples to its end
+    state = make_record(
+        samples=np.int64(0),  # in the current block
+        anchor=np.zeros(SIGNALS),  # the last sample of the block before
+        head=np.zeros(SUMS),  # sums of the current block so far, while it does not move
+        window=np.zeros(SUMS),  # sums of the window
+        moves=np.bool_(False),  # a sample of the block is too far from the anchor for any static window
+        moves_until=np.int64(n),  # of the block before, the last sample that is; `tail` begins after it
+        bias=noise.gyro_bias,  # [rad/s] the known bias of condition (5)
+        bias_var=np.trace(noise.gyro_bias_cov) / 3.0,  # [rad²/s²]
+        average_rate=0.0,  # [rad/s] about the vertical, beyond the known bias
+    )
+    return state, model, block, tail
 
 
 @inlined
@@ -273,7 +249,18 @@ def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ign
 
 
 @kernel
-def _run(states, models, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+def find_static(states, models, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+    """Fill `static` (n,): the window that ends at a sample of `gyro_S`, `accel_S` (n, 3), contiguous, is static.
+
+    A run cut in two gives the same answer to the last bit. Until the first window is full the answer is no, and so it
+    is while a sample that is no number lies in the window.
+
+    The cost per sample does not grow with the window: the window is the sums of the current block of N samples and
+    those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
+    and the differences summed are from a sample within the window, so that (mean − anchor)² is at most N − 1 variances
+    of the window itself: a static window is as precise after 1e8 samples of any motion as in the first second.
+    Condition (5) alone has a longer memory, the known bias.
+    """
     state, model = states[0], models[0]
     window, anchor, limits, share = state.window, state.anchor, model.limits, 1.0 / len(block)
     for k in range(len(gyro_S)):

@@ -137,7 +137,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         Sensor → its faults; sensors without are left out.
     """
     faults: dict[str, list[Fault]] = {}
-    for name, (time, gyro_S, accel_S) in samples.items():
+    for name, (time, *signals) in samples.items():
+        gyro_S, accel_S = map(np.ascontiguousarray, signals)
         if not (_repeats(gyro_S) or _repeats(accel_S)):
             continue
         covered = np.zeros(len(time), dtype=bool)

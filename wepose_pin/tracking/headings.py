@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..filters.butterworth import BandPass
+from ..filters.butterworth import filter_chunk, settle_band_pass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
 from .heading_filter import HeadingFilter, symmetric
 from .heading_problem import HeadingProblem
@@ -127,7 +127,7 @@ class HeadingCorrector:
         self._quat_WV = rotations.rotation_about(E_Z, offset)
         self._filter = HeadingFilter(problem, start)
         # Of the joint accelerations: their band-pass, and the last two samples of the last knot.
-        self._band: BandPass | None = None
+        self._band: tuple[np.ndarray, np.ndarray] | None = None
         self._last_R_WS, self._last_accel_S = np.zeros((2, k, 3, 3)), np.zeros((2, k, 3))
         self._size = problem.stride * problem.samples_per_knot
         self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if problem.causal else 0
@@ -217,11 +217,11 @@ class HeadingCorrector:
         if self._band is None:
             self._last_R_WS, accel_S[:2] = np.repeat(R_WS[:1], 2, axis=0), accel_S[2]
             steady = compute_sides(np.repeat(R_WS[:1], 3, axis=0), np.repeat(accel_S[2:3], 3, axis=0), rate_hz)
-            self._band = BandPass(BAND_HZ, rate_hz, steady.ravel())
+            self._band = settle_band_pass(BAND_HZ, rate_hz, steady.ravel())
         R_WS = np.concatenate([self._last_R_WS, R_WS])
         self._last_R_WS, self._last_accel_S = R_WS[-2:], accel_S[-2:]
         B = compute_sides(R_WS, accel_S, rate_hz)
-        return self._band.push(B.reshape(len(B), -1)).reshape(B.shape)
+        return filter_chunk(*self._band, B.reshape(len(B), -1)).reshape(B.shape)
 
     def _apply(self) -> None:
         """Finish the last knot; causally its correction fades in from the next sample on."""
