@@ -137,8 +137,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         Sensor → its faults; sensors without are left out.
     """
     faults: dict[str, list[Fault]] = {}
-    for name, (time, *signals) in samples.items():
-        gyro_S, accel_S = map(np.ascontiguousarray, signals)
+    for name, (time, *values) in samples.items():
+        gyro_S, accel_S = map(np.ascontiguousarray, values)
         if not (_repeats(gyro_S) or _repeats(accel_S)):
             continue
         covered = np.zeros(len(time), dtype=bool)
