@@ -68,7 +68,7 @@ def track(
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..report.pages import write_track_pages
-    from ..tracking import CHUNK_S, SummaryAccumulator, Tracker, track_chunks
+    from ..tracking import CHUNK_S, Tracker, TrackSummary, track_chunks
     from ..writers.provenance import collect_provenance, result_folder
     from ..writers.result import write_about, write_poses
 
@@ -94,16 +94,15 @@ def track(
                 float("inf") if torques else CHUNK_S,
                 lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
             )
-            accumulator = SummaryAccumulator(recording)
-            write_poses(folder, accumulator.accumulate(chunks), covariance)
-            summary, joint_torques = accumulator.finish(), None
+            summary, joint_torques = TrackSummary(recording), None
+            write_poses(folder, summary.accumulate(chunks), covariance)
             if torques:
                 from ..angles.torques import pose_torques
 
-                joint_torques = pose_torques(accumulator.last)
+                joint_torques = pose_torques(summary.last)
             # Collected last, so that an input that is wrong is reported by its reader.
             provenance = collect_provenance("track", options)
-            write_about(folder, accumulator.last, summary, joint_torques, provenance)
+            write_about(folder, summary.last, summary, joint_torques, provenance)
         progress("making the pages", 2 / 3)
         failures = write_track_pages(out, summary, view=view, report=report)
     content = summary.content

@@ -30,7 +30,7 @@ from ..recording import ImuSensor, Recording
 from ..recording.arrivals import COUNTS, CUT_OFF, MISSING, Samples, Ticks
 from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker
-from ..tracking.heading_problem import CAUSAL_KNOT_S
+from ..tracking.heading_filter import CAUSAL_KNOT_S
 from ..writers.live_log import LiveLog, check_absent
 from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts

@@ -9,11 +9,10 @@ import numpy as np
 
 from ..angles import AUTO, Angles, joint_angles, summary
 from ..body import BodyTable
+from ..body.links import compute_axis_std
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (
-    Signal,
-    TipMotion,
     compute_joint_heading_stds,
     find_samples_after_start,
     finite_max,
@@ -21,7 +20,7 @@ from ..tracking.measures import (
     group_by_source,
     has_stated_mounts,
     longest_run_s,
-    measure_tips,
+    measure_reach,
 )
 from .angles import draw_joint_angles
 from .figures import (
@@ -69,13 +68,13 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
     return render_page(
         f"Motion of {recording.name or 'a recording'}",
         [
-            _describe_reliance(tracked, measures, angles),
+            _describe_reliance(tracked, angles),
             show_diagnostics(summary.diagnostics, f"**No warnings.** {checked} are within their limits."),
-            _describe_recording(tracked, measures),
+            _describe_recording(tracked),
         ],
         {
             "What was recorded": _list_recorded(tracked, measures),
-            "Drift of the headings": _list_drift(tracked, measures.headings),
+            "Drift of the headings": _list_drift(tracked, measures.heading_stds[0]),
             f"The {_name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
             "The motion in 3D": [frame],
@@ -87,7 +86,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
 # Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _describe_reliance(tracked: TrackResult, measures: TrackSummary, angles: Angles | None) -> str:
+def _describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
     """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
     after_start, table = find_samples_after_start(tracked), tracked.model.table
     stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
@@ -102,7 +101,8 @@ def _describe_reliance(tracked: TrackResult, measures: TrackSummary, angles: Ang
     best = next((name for name in stds if name in hinges), min(stds, key=stds.__getitem__, default=None))
     worst = max(stds, key=stds.__getitem__, default=None)
     good = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
-    tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
+    covs, reaches = tracked.pose.point_cov, measure_reach(tracked.pose, table)
+    tips = [finite_median(compute_axis_std(covs[name])[after_start]) for name in reaches if name in covs]
     if np.isfinite(tips).any():
         root = "the root" if table.is_mechanism else "the middle of the hips"
         good.append(f"{_name_tips(table, table.drawn_limbs)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
@@ -122,19 +122,19 @@ def _explain_no_covariance(tracked: TrackResult) -> str:
     )
 
 
-def _describe_recording(tracked: TrackResult, measures: TrackSummary) -> str:
+def _describe_recording(tracked: TrackResult) -> str:
     recording, time = tracked.recording, tracked.time
     text = (
-        f"{recording.time[-1] - recording.time[0]:.0f} s at {measures.rate_hz:g} Hz from "
-        f"{len(measures.signals)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
+        f"{recording.time[-1] - recording.time[0]:.0f} s at {recording.rate_hz:g} Hz from "
+        f"{len(recording.sensors)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
         "standard deviation throughout: two times out of three the truth lies within."
     )
     if tracked.subject.is_population and not tracked.model.table.is_mechanism:
         text += " `wepose calibrate` measures those of the person."
-    if measures.samples > len(recording):
+    if len(recording) > len(time):
         text += (
-            f" Angles and positions are shown for {len(recording)} samples, one in "
-            f"{measures.samples / len(recording):.0f}; extremes, static phases and losses include all samples."
+            f" Angles and positions are shown for {len(time)} samples, one in {len(recording) / len(time):.0f}; "
+            "extremes, static phases and losses include all samples."
         )
     before = float(time[np.argmax(find_samples_after_start(tracked))] - time[0])
     if before >= 1.0:
@@ -145,22 +145,26 @@ def _describe_recording(tracked: TrackResult, measures: TrackSummary) -> str:
 def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     rate_hz, rows = tracked.recording.rate_hz, []
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in tracked.recording.phases.items())
-    for name, signal in measures.signals.items():
-        cells = [f"{np.degrees(signal.rate.max()):.0f} °/s"]
-        cells += [f"{np.count_nonzero(mask) / rate_hz:.2f} s" for mask in (signal.cut, signal.gap)]
-        if signal.static is None or signal.bias is None:  # measured orientations
+    for name, (rate, cut) in measures.signals.items():
+        gap, orientation = tracked.recording.sensors[name].gap, tracked.segments.orientation.get(name)
+        lost = 0 if gap is None else np.count_nonzero(gap)
+        cells = [f"{np.degrees(rate.max()):.0f} °/s"]
+        cells += [f"{samples / rate_hz:.2f} s" for samples in (np.count_nonzero(cut), lost)]
+        if orientation is None:  # measured orientations
             cells += [""] * 5
         else:
-            cells += [f"{100 * signal.static.mean():.0f} %", f"{longest_run_s(~signal.static, rate_hz):.0f} s"]
-            cells += [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in signal.bias]
-            cells.append(f"{signal.gravity:.3f} m/s²")
+            static, biases = measures.static[name], (orientation.noise.gyro_bias, orientation.gyro_bias[-1])
+            cells += [f"{100 * static.mean():.0f} %", f"{longest_run_s(~static, rate_hz):.0f} s"]
+            cells += [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in biases]
+            cells.append(f"{orientation.noise.gravity:.3f} m/s²")
         rows.append([plain(name), *cells])
     header = ["sensor", "fastest rotation", "saturated", "lost", "static", "longest motion"]
-    steps = " to ".join(dict.fromkeys(f"{step:.2f}" for step in measures.steps_ms))
+    steps_ms = 1e3 * np.diff(tracked.recording.time)
+    steps = " to ".join(dict.fromkeys(f"{step:.2f}" for step in (steps_ms.min(), steps_ms.max())))
     return [
-        f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {steps} ms."
+        f"{len(tracked.recording)} samples at {rate_hz:g} Hz, one every {steps} ms."
         f"{f' Phases: {phases}.' if phases else ''}",
-        draw_timeline(tracked, measures.signals),
+        draw_timeline(measures),
         Table("", [*header, "bias at first", "bias at the end", "gravity"], rows),
         "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
         "sensor is static its gyroscope measures its bias, and the heading does not drift. An error of 0.1 °/s in the "
@@ -199,15 +203,16 @@ def _list_drift(tracked: TrackResult, stds: Mapping[str, np.ndarray]) -> list[It
 
 def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
-    items: list[Item] = list(draw_tips(tracked.time, measures.tips, table).values())
-    for title, tips in group_tips(measures.tips, table).items():
+    reaches, covs = measure_reach(tracked.pose, table), tracked.pose.point_cov
+    items: list[Item] = list(draw_tips(tracked.time, reaches, table).values())
+    for title, tips in group_tips(reaches, table).items():
         rows = []
-        for name, tip in tips.items():
-            low, high = np.nanpercentile(100 * tip.reach, [1.0, 99.0], axis=0)
+        for name, reach in tips.items():
+            low, high = np.nanpercentile(100 * reach, [1.0, 99.0], axis=0)
             ranges = [f"{number(a, 0)} to {number(b, 0)}" for a, b in zip(low, high, strict=True)]
-            std = np.full(1, np.nan) if tip.std is None else 1e3 * tip.std[after_start]
+            std = 1e3 * compute_axis_std(covs[name])[after_start] if name in covs else np.full(1, np.nan)
             stds = [spread(each(std), 0, " mm") for each in (finite_median, finite_max)]
-            rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *stds])
+            rows.append([plain(name), *ranges, f"{measures.peak_speed[name]:.1f} m/s", *stds])
         items.append(Table(f"The {title}", ["", *AXES, "highest speed", "median ±", "largest ±"], rows))
     if not items:
         return []
@@ -271,17 +276,18 @@ def draw_figures(result: TrackResult) -> Figures:
     """Draw the paths of the hands and their reach, and the joint angles, of what is known; as `TrackResult.plot`."""
     figures, table = Figures(), result.model.table
     if len(result.time) > 1:
-        figures |= draw_tips(result.time, measure_tips(result.pose, result.rate_hz, table), table)
+        figures |= draw_tips(result.time, measure_reach(result.pose, table), table)
     with contextlib.suppress(BadData):  # no joint has both of its segments
         figures["angles"] = draw_joint_angles(joint_angles(result.pose, AUTO))
     return figures
 
 
 @styled
-def draw_timeline(tracked: TrackResult, signals: Mapping[str, Signal]) -> ReportFigure:
+def draw_timeline(measures: TrackSummary) -> ReportFigure:
     """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
-    time, table = tracked.time, tracked.model.table
-    most = max(1.0, max(float(np.degrees(signal.rate.max())) for signal in signals.values()))
+    recording, signals, table = measures.recording, measures.signals, measures.last.model.table
+    time = recording.time
+    most = max(1.0, max(float(np.degrees(rate.max())) for rate, _ in signals.values()))
     figure = ReportFigure(
         f"How fast each sensor rotated, on one scale: a row is {most:.0f} °/s high. "
         "Black bars under a row: static by the filter's test.",
@@ -293,18 +299,19 @@ def draw_timeline(tracked: TrackResult, signals: Mapping[str, Signal]) -> Report
     ax.set_yticks(-np.arange(len(signals)), [plain(name) for name in signals])
     ax.set_xlabel("time [s]")
     ax.grid(axis="y", visible=False)
-    for name, spans in tracked.recording.phases.items():
+    for name, spans in recording.phases.items():
         shade(ax, spans, "phase")
         for begin, end in spans:
             if 110.0 * (end - begin) / (time[-1] - time[0]) > len(name):  # as many letters are as wide as the plot
                 ax.text(begin, 1.02, f" {name}", fontsize=8)
-    for row, (name, signal) in enumerate(signals.items()):
-        at, rate = envelope(time, np.degrees(signal.rate))
+    for row, (name, (rate, cut)) in enumerate(signals.items()):
+        at, rate = envelope(time, np.degrees(rate))
         ax.fill_between(at, -row, 0.85 * rate / most - row, color=COLOURS[table.side(name) or "other"], linewidth=0)
+        gap = recording.sensors[name].gap
         for mask, label, low, height, look in (
-            (signal.static, "static", -0.1, 0.07, {"facecolor": "black"}),
-            (signal.gap, "lost and interpolated", 0.0, 0.85, {"facecolor": "none", "edgecolor": SOFT, "hatch": "////"}),
-            (signal.cut, "saturated", 0.85, 0.1, {"facecolor": ALARM, "edgecolor": ALARM, "linewidth": 1.0}),
+            (measures.static.get(name), "static", -0.1, 0.07, {"facecolor": "black"}),
+            (gap, "lost and interpolated", 0.0, 0.85, {"facecolor": "none", "edgecolor": SOFT, "hatch": "////"}),
+            (cut, "saturated", 0.85, 0.1, {"facecolor": ALARM, "edgecolor": ALARM, "linewidth": 1.0}),
         ):
             if mask is not None and mask.any():
                 bars = [(begin, end - begin) for begin, end in find_spans(time, mask)]
@@ -313,9 +320,9 @@ def draw_timeline(tracked: TrackResult, signals: Mapping[str, Signal]) -> Report
     return figure
 
 
-def group_tips(tips: Mapping[str, TipMotion], table: BodyTable) -> dict[str, dict[str, TipMotion]]:
+def group_tips(tips: Mapping[str, np.ndarray], table: BodyTable) -> dict[str, dict[str, np.ndarray]]:
     """Group points by where their limbs begin: what the points are on and where a reach begins, in words → points."""
-    groups: dict[str, dict[str, TipMotion]] = {}
+    groups: dict[str, dict[str, np.ndarray]] = {}
     for origin in dict.fromkeys(table.drawn_limbs[name].origin for name in tips):
         own = {name: tip for name, tip in tips.items() if table.drawn_limbs[name].origin == origin}
         base, start = table.drawn_limbs[next(iter(own))].base, plain(table.shared_name(origin[0]))
@@ -331,7 +338,7 @@ def _name_tips(table: BodyTable, points: Iterable[str]) -> str:
 
 
 @styled
-def draw_tips(time: np.ndarray, tips: Mapping[str, TipMotion], table: BodyTable) -> dict[str, ReportFigure]:
+def draw_tips(time: np.ndarray, tips: Mapping[str, np.ndarray], table: BodyTable) -> dict[str, ReportFigure]:
     """Draw "paths", the tips seen from the front, the right and above, and "reach", the tips over time."""
     groups = group_tips(tips, table)
     if not groups:
@@ -350,12 +357,12 @@ def draw_tips(time: np.ndarray, tips: Mapping[str, TipMotion], table: BodyTable)
             if view == "from above":
                 ax.invert_xaxis()
             ax.plot(0.0, 0.0, "+", color=SOFT, markersize=10, label="where the reach begins")
-            for name, tip in group.items():
-                at = 100.0 * tip.reach[:: max(1, len(tip.reach) // PATH_POINTS)][:, [across, up]]
+            for name, reach in group.items():
+                at = 100.0 * reach[:: max(1, len(reach) // PATH_POINTS)][:, [across, up]]
                 ax.plot(at[:, 0], at[:, 1], **{**styles[name], "linewidth": 0.7})
                 ax.plot(at[:1, 0], at[:1, 1], "s" if table.side(name) == "right" else "o", color=styles[name]["color"])
         for k, label in enumerate(AXES):
             heading = label if len(groups) == 1 else f"{title.partition(',')[0]}: {label}"
-            panels[heading] = {name: 100.0 * tip.reach[:, k] for name, tip in group.items()}
+            panels[heading] = {name: 100.0 * reach[:, k] for name, reach in group.items()}
     paths.add_legend()
     return {"paths": paths, "reach": draw_over_time(time, panels, f"{caption}: over time.", styles)}

@@ -18,7 +18,7 @@ from ..filters import BEST
 from ..filters.static import StaticTest
 from ..recording import Recording
 from .result import TrackResult
-from .summary import SummaryAccumulator, TrackSummary, summarize
+from .summary import TrackSummary, summarize
 from .tracker import CHUNK_S, Tracker, track_chunks
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ else:  # checked as the subject that it has; the room of calibrations loads slow
 
 __all__ = [
     "CHUNK_S",
-    "SummaryAccumulator",
     "TrackResult",
     "TrackSummary",
     "Tracker",

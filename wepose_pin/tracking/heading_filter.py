@@ -1,12 +1,12 @@
 """A Kalman filter of heading errors over knots of a recording: it owns the headings and the biases about the vertical.
 
-δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ_i) R_WL. It changes by a random walk and by a
-rate that changes slowly: the bias about the vertical. An orientation filter corrects both by what its own sensor shows,
-as in a static phase. The headings here are those without its corrections, and what it has learned of the bias is one
-more observation. Differences of two or more δ are observed by:
+Time is cut into intervals of equal length, the knots. δ_i is the heading error of segment i, on the left in W:
+R_WL,true = Rz(δ_i) R_WL. It changes by a random walk and by a rate that changes slowly: the bias about the vertical. An
+orientation filter corrects both by what its own sensor shows, as in a static phase. The headings here are those without
+its corrections, and what it has learned of the bias is one more observation. Differences of two or more δ are observed
+by (`wepose_pin.observations`):
 
-- the acceleration of a joint, which two sensors measure (`observations.joint_accelerations`), with their levers as
-  unknowns;
+- the acceleration of a joint, which two sensors measure, with their levers as unknowns;
 - a hinge: the long axis of the segment below stays in the plane across the hinge's axis, within its range;
 - two points that coincide: palms in a phase `clasp`.
 
@@ -16,15 +16,41 @@ They are states, so that a long recording does not average them away.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
-from ..body.mounts import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
-from ..observations.expressions import linearize_hinge
-from ..observations.joint_accelerations import linearize_joint
-from .heading_problem import HeadingProblem
+from ..body import BodyModel
+from ..body.mounts import (
+    PALM_SLIP_STD,
+    SEGMENT_ATTITUDE_STD,
+    StartPose,
+    compute_start_heading_var,
+    find_mount_covariance,
+)
+from ..body.subject import Subject
+from ..calibration import load_protocol
+from ..errors import BadSession
+from ..filters.noise import SensorNoise
+from ..observations.expressions import HingePlane, PointPath, find_hinges, linearize_hinge
+from ..observations.joint_accelerations import LEAST_RATE_HZ, find_joint_pairs, linearize_joint
+from ..recording import Recording
+
+CLASP = "clasp"  # the phase in which the palms are joined, and its protocol
+REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
+MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption
+LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
+# [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
+CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
+SAMPLE_RATE_HZ = 8.0
+# Standard deviation of the delay of an accelerometer against its gyroscope: half a sample, over which it averages, and
+# what filters inside the chips differ by [s]; assumption.
+AVERAGED_SAMPLES, CHIP_DELAY_STD = 0.5, 0.002
+
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
@@ -50,46 +76,127 @@ _JOINT_JACOBIAN = np.zeros((15, 17))
 _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 
 
-class HeadingFilter:
-    """The state and its covariance, knot by knot.
+@dataclass(frozen=True)
+class HeadingNoise:
+    """Standard deviations, power spectral densities and correlation times of the heading filter: those of a person."""
 
-    What the orientation filters of the k sensors know after a sample is `filters` (4, k): the variance [rad²] of the
+    drift_psd: float = float(np.deg2rad(0.12) ** 2)  # [rad²/s] of a heading in motion: scale errors, soft tissue
+    rate_std: float = float(np.deg2rad(0.05))  # [rad/s] at which a heading drifts, apart from its gyroscope's bias
+    rate_change_psd: float = float(np.deg2rad(0.1) ** 2 / 900.0)  # [rad²/s³] a sensor warms up under its strap
+    # [rad] of the heading by a joint's acceleration: soft tissue and a travelling shoulder follow the motion.
+    joint_std: float = float(np.deg2rad(0.5))
+    girdle_std: float = float(np.deg2rad(0.9))
+    joint_correlation_s: float = 60.0
+    acceleration_std: float = 0.07  # [m/s²] least misfit of a joint's accelerations; the recent one where it is larger
+    acceleration_correlation_s: float = 0.4
+    # [m/s²] fixed in the sensor's frame: the tilt error of an orientation filter in motion, a degree, times gravity.
+    force_std: float = float(np.deg2rad(1.0) * 9.81)
+    force_correlation_s: float = 20.0
+    twist_std: float = float(np.deg2rad(7.0))  # [rad] of a sensor about its segment's long axis by soft tissue
+    twist_correlation_s: float = 4.0
+    hinge_std: float = float(np.deg2rad(4.0))  # [rad] other errors between a hinge's plane and the segment below
+    hinge_correlation_s: float = 5.0
+    # [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
+    axis_std: float = float(np.deg2rad(5.0))
+    tilt_std: float = float(np.deg2rad(2.0))
+    range_std: float = float(np.deg2rad(10.0))  # [rad] of the limits of a hinge's range
+    closure_correlation_s: float = 20.0
+
+
+PERSON_NOISE = HeadingNoise()
+MECHANISM_NOISE = HeadingNoise(
+    rate_std=float(np.deg2rad(0.2)),
+    girdle_std=float(np.deg2rad(0.5)),
+    twist_std=float(np.deg2rad(0.5)),
+    hinge_std=float(np.deg2rad(0.5)),
+)
+
+
+class HeadingFilter:
+    """What observes the headings of k sensors, and the state and its covariance, knot by knot.
+
+    What the orientation filters of the sensors know after a sample is `filters` (4, k): the variance [rad²] of the
     heading, and the columns of `Orientation.about_vertical`; NaN without a covariance.
 
     Parameters
     ----------
+    first : the first chunk, or the one that ends with the start pose
+    quat_LS : segment → (4,) xyzw of its sensor, the mount used
+    noises : of sensors with a filter
+    subject, model : the person, and the body with the person's lengths
     start : `filters` at the end of the start pose
+    causal : headings are corrected as samples come; a short clasp then counts as one observation
 
     Attributes
     ----------
+    pairs, hinges, palms : joints between two sensors, hinges, and the points that the phase `CLASP` joins
+    is_observed : whether one of them tells of the headings
+    start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
+    stride : sensors' samples from one sample of a knot to the next
     x, P : (n,), (n, n); the first k are δ [rad]
     process : how x changes in the last knot besides what it does by itself, and the variance of that; (n,) each
     """
 
-    def __init__(self, problem: HeadingProblem, start: np.ndarray) -> None:
-        self.problem, self._last = problem, start
-        noise, k, h, always = problem.noise, len(problem.names), len(problem.hinges), np.inf
-        known = np.sqrt(start[3])
-        rate_std = np.hypot(noise.rate_std, np.where(np.isfinite(known), known, problem.rate_std))
-        joint_std = np.array([noise.girdle_std if pair.travels else noise.joint_std for pair in problem.pairs])
-        lever_std = np.array([[pair.lever_std] * 6 for pair in problem.pairs]).reshape(-1, 6)
+    def __init__(
+        self,
+        first: Recording,
+        quat_LS: Mapping[str, np.ndarray],
+        noises: Mapping[str, SensorNoise],
+        subject: Subject,
+        model: BodyModel,
+        start: np.ndarray,
+        *,
+        causal: bool,
+    ) -> None:
+        self.names, self.causal, self._last, k = tuple(quat_LS), causal, start, len(quat_LS)
+        self.noise = noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
+        raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
+        self.measured = np.array([name not in raw for name in self.names])
+        self.pairs = find_joint_pairs(model, raw) if first.rate_hz >= LEAST_RATE_HZ else ()
+        self.hinges, axis_std, tilt_std, self._hinge_std = _find_hinges(first, self.names, subject, model, noise)
+        [closure] = load_protocol(CLASP).closures
+        self.palms, (left, right) = None, closure.points
+        if {left, right} <= set(model.table.points):
+            with contextlib.suppress(BadSession):  # the sensors do not tell where they are
+                points = (left, 1.0), (right, -1.0)
+                self.palms = PointPath(model, StartPose(model.neutral_rotations), self.names, points)
+        self.is_observed = bool(self.pairs or self.hinges or (self.palms and first.phases.get(CLASP)))
+        self.sensor_rate_hz, self.stride = first.rate_hz, max(1, round(first.rate_hz / SAMPLE_RATE_HZ))
+        knot_s = CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S
+        self.samples_per_knot = max(1, round(knot_s * first.rate_hz / self.stride))
+        self.knot_s = self.samples_per_knot * self.stride / first.rate_hz
+        self.rate_hz = self.samples_per_knot / self.knot_s  # of a knot's samples
+        neutral = Rotation.from_matrix([model.neutral_rotations[name] for name in self.names])  # L to L'
+        mounts = Rotation.from_quat([quat_LS[name] for name in self.names])
+        self.quat_SL = (neutral * mounts).inv().as_quat()  # (k, 4) xyzw, from L' to the sensor
+        # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
+        # gyroscope's bias, or the drift of measured orientations.
+        self._drift_psd, rate_std = np.full(k, noise.drift_psd), np.full(k, MEASURED_RATE_STD)
+        for i, name in enumerate(self.names):
+            if name in noises:  # a gyroscope's white noise may be more
+                gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
+                self._drift_psd[i] = max(noise.drift_psd, gyro_psd)
+                rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
+        self.start_var, self.mount_var = np.array(
+            [_find_start_variances(first, name, subject, model) for name in self.names]
+        ).T
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
+        h, always, known = len(self.hinges), np.inf, np.sqrt(start[3])
+        rate_std = np.hypot(noise.rate_std, np.where(np.isfinite(known), known, rate_std))
+        joint_std = np.array([noise.girdle_std if pair.travels else noise.joint_std for pair in self.pairs])
+        lever_std = np.array([[pair.lever_std] * 6 for pair in self.pairs]).reshape(-1, 6)
+        twist_std, force_std = np.full(h, noise.twist_std), np.full((k, 3), noise.force_std)
+        delay_std = np.full(k, AVERAGED_SAMPLES / first.rate_hz + CHIP_DELAY_STD)
         states = {
             "heading": (np.zeros(k), always),  # δ [rad]
             "rate": (rate_std, always),  # [rad/s] at which δ drifts
             "joint": (joint_std, noise.joint_correlation_s),  # [rad] of the heading by a joint's acceleration
-            "axis": (problem.hinge_std[:, 0], always),  # [rad] of a hinge about the long axis of the segment above
-            "twist": (
-                np.full(h, noise.twist_std),
-                noise.twist_correlation_s,
-            ),  # [rad] of that segment's sensor, the same
-            "tilt": (problem.hinge_std[:, 1], always),  # [rad] of a hinge about the direction across
+            "axis": (axis_std, always),  # [rad] of a hinge about the long axis of the segment above
+            "twist": (twist_std, noise.twist_correlation_s),  # [rad] of that segment's sensor, the same
+            "tilt": (tilt_std, always),  # [rad] of a hinge about the direction across
             "mount": (np.zeros(k), always),  # [rad] of a mount's heading
-            "force": (
-                np.full((k, 3), noise.force_std),
-                noise.force_correlation_s,
-            ),  # [m/s²] fixed in the sensor's frame
-            "delay": (np.full(k, problem.delay_std), always),  # [s] of the accelerometer
+            "force": (force_std, noise.force_correlation_s),  # [m/s²] fixed in the sensor's frame
+            "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
             "start": (np.zeros(k), always),  # [rad] of the segment's heading in the start pose
             "lever": (lever_std, always),  # [m] of the near and the far sensor from the joint
         }
@@ -99,28 +206,28 @@ class HeadingFilter:
             name: own.reshape(std.shape) for own, (name, (std, _)) in zip(places, states.items(), strict=True)
         }
         std = np.concatenate([std.ravel() for std, _ in states.values()])
-        self._decay = np.concatenate([np.full(std.size, np.exp(-problem.knot_s / t)) for std, t in states.values()])
+        self._decay = np.concatenate([np.full(std.size, np.exp(-self.knot_s / t)) for std, t in states.values()])
         self._process_var = (1.0 - self._decay**2) * std**2
-        self._process_var[c["rate"]] = noise.rate_change_psd * problem.knot_s
+        self._process_var[c["rate"]] = noise.rate_change_psd * self.knot_s
         self.x, self.P = np.zeros(len(std)), np.diag(std**2)
-        index = problem.names.index
+        index = self.names.index
         self._pair_columns = []  # (17,) each: headings of its segments, joint; lever, force and delay near and far
-        for i, pair in enumerate(problem.pairs):
+        for i, pair in enumerate(self.pairs):
             self.x[c["lever"][i]] = pair.levers
             near, far, lever = index(pair.near), index(pair.far), c["lever"][i]
             sides = [(*own, *c["force"][at], c["delay"][at]) for own, at in ((lever[:3], near), (lever[3:], far))]
             self._pair_columns.append(np.array([near, far, c["joint"][i], *sides[0], *sides[1]]))
         self._hinge_columns = [  # (5,) each: headings of the segments below and above, axis, twist, tilt
             np.array([index(hinge.moves), index(hinge.on), *(c[name][i] for name in ("axis", "twist", "tilt"))])
-            for i, hinge in enumerate(problem.hinges)
+            for i, hinge in enumerate(self.hinges)
         ]
-        self._shape_cov = problem.subject.shape_covariance(problem.model.table)
+        self._shape_cov = subject.shape_covariance(model.table)
         # What care adds to the information (k,) [1/rad²] of the start pose.
-        self._care_information = (CAREFUL_SHARE**-2 - 1.0) / problem.start_var
+        self._care_information = (CAREFUL_SHARE**-2 - 1.0) / self.start_var
         self._set_start_covariance()
         # Recent misfit e of each joint's accelerations, with its force f: sums of e fᵀ (9), e² (3) and f² (3) [m²/s⁴]
         # over samples, in which older ones count less, and how many count.
-        self._misfits = np.zeros((len(problem.pairs), 16))
+        self._misfits = np.zeros((len(self.pairs), 16))
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
         self._clasped_before = False  # whether the palms were joined in the last knot
@@ -132,7 +239,7 @@ class HeadingFilter:
 
     def _set_start_covariance(self) -> None:
         """Set the covariance of δ = s − ε_z, of the mounts' ε_z and of the segments' s after a start pose."""
-        P, start_var, mount_var = self.P, self.problem.start_var, self.problem.mount_var
+        P, start_var, mount_var = self.P, self.start_var, self.mount_var
         heading, mount, start = (self._columns[name] for name in ("heading", "mount", "start"))
         for columns in (heading, mount, start):
             P[columns, :], P[:, columns] = 0.0, 0.0
@@ -158,10 +265,9 @@ class HeadingFilter:
         self.process = self._find_process(filters, lost)
         self.predict(self.process)
         yield
-        problem, k = self.problem, len(lost)
         unreliable = lost | self._lost_before  # after a loss the tilt may be wrong
-        palms = problem.palms if clasped.any() else None
-        if palms is not None and unreliable[[problem.names.index(name) for name in palms.segments]].any():
+        palms = self.palms if clasped.any() else None
+        if palms is not None and unreliable[[self.names.index(name) for name in palms.segments]].any():
             palms = None
         x, misfits, identity = self.x, self._misfits, np.eye(len(self.x))
         for _ in range(ITERATIONS):
@@ -171,11 +277,11 @@ class HeadingFilter:
             yield
             yield from self._add_hinges(x, quat_WL, unreliable)
             if palms is not None:
-                correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
-                if problem.causal and not self._clasped_before:
+                correlated = max(1.0, self.noise.closure_correlation_s * self.rate_hz)
+                if self.causal and not self._clasped_before:
                     # Causally all of a clasp's first knot is one observation: a clasp may be shorter than that.
                     correlated = float(len(quat_WL))
-                self._add_gap(palms.linearize(quat_WL[clasped], x[:k]), correlated)
+                self._add_gap(palms.linearize(quat_WL[clasped], x[: len(lost)]), correlated)
                 yield
             right = self.P @ (self._matrix @ (x - self.x) - self._vector)
             x = np.asarray(self.x + np.linalg.solve(identity + self.P @ self._matrix, right))
@@ -191,25 +297,25 @@ class HeadingFilter:
         What the filter has corrected of its heading and its bias is taken back. A bias is less certain where another
         axis of the sensor becomes vertical.
         """
-        problem, (heading, rate) = self.problem, (self._columns["heading"], self._columns["rate"])
+        heading, rate = self._columns["heading"], self._columns["rate"]
         gained_var, corrected, corrected_rate, gained_rate_var = filters - self._last
-        least = problem.drift_psd * problem.knot_s
-        gained = np.maximum(gained_var, MIN_DRIFT_PSD * problem.knot_s)
+        least = self._drift_psd * self.knot_s
+        gained = np.maximum(gained_var, MIN_DRIFT_PSD * self.knot_s)
         known = np.isfinite(gained)
         leaps = lost | (gained > LEAP_RATIO * np.maximum(self._recent_growth, least))
-        remembered = self._recent_growth * np.exp(-problem.knot_s / GROWTH_MEMORY_S)
+        remembered = self._recent_growth * np.exp(-self.knot_s / GROWTH_MEMORY_S)
         self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
         change, variance = np.zeros(len(self.x)), self._process_var.copy()
         change[heading], change[rate] = -np.nan_to_num(corrected), np.nan_to_num(corrected_rate)
         drift = np.where(leaps, gained, np.minimum(gained, least))
-        variance[heading] += np.where(known, drift, UNKNOWN_DRIFT_PSD * problem.knot_s)
+        variance[heading] += np.where(known, drift, UNKNOWN_DRIFT_PSD * self.knot_s)
         variance[rate] += np.nan_to_num(np.maximum(gained_rate_var, 0.0))
         return change, variance
 
     def advance(self, values: np.ndarray) -> np.ndarray:
         """Return F v of one knot for v (n,) or (n, m): correlated states decay, headings change by their rates."""
         advanced = np.asarray((self._decay * values.T).T)
-        advanced[self._columns["heading"]] += self.problem.knot_s * values[self._columns["rate"]]
+        advanced[self._columns["heading"]] += self.knot_s * values[self._columns["rate"]]
         return advanced
 
     def predict(self, process: tuple[np.ndarray, np.ndarray]) -> None:
@@ -233,7 +339,7 @@ class HeadingFilter:
         A filter that corrects a bias by c while its variance falls from v to v (1 − K) has observed c/K with the
         variance v (1 − K)/K. The rate here already has c; it is the bias and `rate_std`, which is no bias.
         """
-        columns, other_var = self._columns["rate"], self.problem.noise.rate_std**2
+        columns, other_var = self._columns["rate"], self.noise.rate_std**2
         rate_var, last_rate_var = filters[3] + other_var, self._last[3] + other_var
         learned = 1.0 - rate_var / last_rate_var
         learns = learned > LEAST_LEARNED  # false for NaN
@@ -244,9 +350,9 @@ class HeadingFilter:
 
     def _add_joints(self, x: np.ndarray, sides: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Add the accelerations of joints; return the recent misfits with those of the knot."""
-        problem, misfits = self.problem, self._misfits.copy()
-        correlated = max(1.0, problem.noise.acceleration_correlation_s * problem.rate_hz)
-        decay = np.exp(-problem.knot_s / MISFIT_MEMORY_S)
+        misfits = self._misfits.copy()
+        correlated = max(1.0, self.noise.acceleration_correlation_s * self.rate_hz)
+        decay = np.exp(-self.knot_s / MISFIT_MEMORY_S)
         for misfit, columns in zip(misfits, self._pair_columns, strict=True):
             near, far, joint = columns[:3]
             if lost[near] or lost[far] or not len(sides):
@@ -257,7 +363,7 @@ class HeadingFilter:
             misfit[:] = decay * misfit + np.concatenate(sums)
             r, H = e.ravel(), jacobian.reshape(-1, len(_JOINT_JACOBIAN)) @ _JOINT_JACOBIAN
             variance, coherent_var = _split_misfit(misfit, correlated)
-            least_var = problem.noise.acceleration_std**2
+            least_var = self.noise.acceleration_std**2
             weight = 1.0 / (max(float(np.mean(r**2)), variance, least_var) * correlated)
             # What is coherent counts as one observation over the time that is remembered.
             weight /= 1.0 + weight * float(H[:, 0] @ H[:, 0]) * coherent_var * (misfit[-1] / len(e))
@@ -266,9 +372,9 @@ class HeadingFilter:
 
     def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> Iterator[None]:
         """Add the hinges and their ranges; yield between them."""
-        problem, noise = self.problem, self.problem.noise
-        samples = max(1.0, noise.hinge_correlation_s * problem.rate_hz)
-        for hinge, columns, std in zip(problem.hinges, self._hinge_columns, problem.hinge_std[:, 2], strict=True):
+        noise = self.noise
+        samples = max(1.0, noise.hinge_correlation_s * self.rate_hz)
+        for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
             moves, on = columns[:2]
             if unreliable[on] or unreliable[moves]:
                 continue
@@ -299,7 +405,7 @@ class HeadingFilter:
         deviation. The likelihood of that follows in closed form from what the filter knows of the errors s of the start
         pose, which are states. Only accelerations of joints tell that much.
         """
-        if not self.problem.pairs:
+        if not self.pairs:
             return 0.0
         columns, information = self._columns["start"], self._care_information
         s, spread = x[columns], np.eye(len(columns)) + information[:, None] * P[np.ix_(columns, columns)]
@@ -314,7 +420,7 @@ class HeadingFilter:
         by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that hangs is off by
         δ + ε_z.
         """
-        columns, information, k = self._columns["start"], self._care_information, len(self.problem.names)
+        columns, information, k = self._columns["start"], self._care_information, len(self.names)
         rows, by_start = np.concatenate([self._columns["heading"], self._columns["mount"]]), P[:, columns]
         spread = np.eye(k) + information[:, None] * by_start[columns]
         gain = by_start[rows] @ np.linalg.solve(spread, np.diag(information))
@@ -348,6 +454,41 @@ def _split_misfit(misfit: np.ndarray, correlated_samples: float) -> tuple[float,
     by_chance = variance / horizontal * correlated_samples / samples
     coherent = COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
     return variance, min(coherent, LARGEST_COHERENT_SHARE**2 * variance * 2.0 * samples / horizontal)
+
+
+def _find_hinges(
+    first: Recording, names: tuple[str, ...], subject: Subject, model: BodyModel, noise: HeadingNoise
+) -> tuple[tuple[HingePlane, ...], np.ndarray, np.ndarray, np.ndarray]:
+    """Find the h hinges between two sensors, and standard deviations (h,) [rad] of three errors.
+
+    They are of the axis about the long axis of the segment above and across, as in `HeadingNoise`, and of the angle
+    between the hinge's plane and the segment below.
+    """
+    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
+    start, calibrated = StartPose(model.neutral_rotations), {} if first.remounted else subject.hinges
+    hinges, stds = [], []
+    for plane in find_hinges(model, start, names):
+        hinge = model.table.hinges[plane.name]
+        if plane.name in calibrated:
+            axis, std = start.turn(plane.on, calibrated[plane.name].axis), calibrated[plane.name].std
+            hinges.append(plane._replace(axis=axis))
+            stds.append((noise.axis_std, noise.tilt_std, max(std, noise.hinge_std)))
+        elif not model.table.is_mechanism:
+            hinges.append(plane)
+            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
+            stds.append((axis_std, hinge.tilt_std, max(hinge.softness, noise.hinge_std)))
+    axis_stds, tilt_stds, plane_stds = np.array(stds).reshape(-1, 3).T
+    return tuple(hinges), axis_stds, tilt_stds, plane_stds
+
+
+def _find_start_variances(first: Recording, segment: str, subject: Subject, model: BodyModel) -> tuple[float, float]:
+    """Find the variances [rad²] of a sensor's heading after the start pose: by the pose, and by the mount's heading."""
+    table = model.table
+    mount_cov = find_mount_covariance(first, segment, subject)
+    mount_var = LEAST_MOUNT_VAR if mount_cov is None else max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
+    if segment == table.reference:
+        return float(REFERENCE_START_STD**2), mount_var
+    return compute_start_heading_var(first, segment, subject, StartPose(table=table)), mount_var
 
 
 def symmetric(P: np.ndarray) -> np.ndarray:

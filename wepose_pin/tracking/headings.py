@@ -19,7 +19,6 @@ from .. import rotations
 from ..filters.butterworth import filter_chunk, settle_band_pass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
 from .heading_filter import HeadingFilter, symmetric
-from .heading_problem import HeadingProblem
 
 E_Z = np.array([0.0, 0.0, 1.0])
 # Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
@@ -31,7 +30,7 @@ SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
 class HeadingCorrection:
     """The correction of the headings of k segments at m knots, and what was observed."""
 
-    problem: HeadingProblem
+    filter: HeadingFilter  # which estimated them
     time: np.ndarray  # (m,) [s] of the knots
     errors: np.ndarray  # (m, k) [rad] that are corrected, on the left in W
     covariance: np.ndarray  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
@@ -39,7 +38,7 @@ class HeadingCorrection:
 
     @property
     def segments(self) -> tuple[str, ...]:
-        return self.problem.names
+        return self.filter.names
 
     @property
     def max_correction_deg(self) -> dict[str, float]:
@@ -50,8 +49,8 @@ class HeadingCorrection:
     def summarize(self) -> dict[str, Any]:
         """What was observed and the largest correction of each heading, as ``summary.json`` has it."""
         return {
-            "joint_accelerations": [pair.far for pair in self.problem.pairs],
-            "hinges": [hinge.name for hinge in self.problem.hinges],
+            "joint_accelerations": [pair.far for pair in self.filter.pairs],
+            "hinges": [hinge.name for hinge in self.filter.hinges],
             "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
         }
 
@@ -96,9 +95,9 @@ class HeadingCorrection:
 
         Causally a knot is used after the next one, and before the first nothing is known.
         """
-        if not self.problem.causal:
+        if not self.filter.causal:
             return np.asarray(np.interp(time, self.time, values))
-        knots = np.searchsorted(self.time, time - self.problem.knot_s, side="right")
+        knots = np.searchsorted(self.time, time - self.filter.knot_s, side="right")
         return np.concatenate(([0.0], values))[knots]
 
 
@@ -111,8 +110,6 @@ class HeadingCorrector:
     Parameters
     ----------
     offset : (k,) ψ [rad] to which corrections are added
-    start : (4, k) what the orientation filters know at the end of the start pose, as in `HeadingFilter`
-    begin : [s] the time of the first sample
 
     Attributes
     ----------
@@ -121,21 +118,19 @@ class HeadingCorrector:
         the squared correction of the headings since the start or the last reset
     """
 
-    def __init__(self, problem: HeadingProblem, offset: np.ndarray, start: np.ndarray, begin: float) -> None:
-        k = len(problem.names)
-        self.problem, self.offset, self._begin_s = problem, offset, begin
+    def __init__(self, heading_filter: HeadingFilter, offset: np.ndarray) -> None:
+        self.filter, self.offset, k = heading_filter, offset, len(offset)
         self._quat_WV = rotations.rotation_about(E_Z, offset)
-        self._filter = HeadingFilter(problem, start)
         # Of the joint accelerations: their band-pass, and the last two samples of the last knot.
         self._band: tuple[np.ndarray, np.ndarray] | None = None
         self._last_R_WS, self._last_accel_S = np.zeros((2, k, 3, 3)), np.zeros((2, k, 3))
-        self._size = problem.stride * problem.samples_per_knot
-        self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if problem.causal else 0
+        self._size = self.filter.stride * self.filter.samples_per_knot
+        self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if self.filter.causal else 0
         self._quat_VS, self._accel_S = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
         self._clasped = np.zeros(self._size, dtype=bool)
-        self._count = self._knots = 0  # samples in the open knot, knots before it
-        self._knot_end, self._records = begin, False  # of the last knot: its end [s], whether it is recorded
+        self._count = 0  # samples in the open knot
         self._solving: Iterator[None] | None = None  # the last knot, until it is done
+        self._knot_end: float | None = None  # [s] of the last knot; None: its result is not collected
         self._from, self._to, self._at_reset = np.zeros((3, k))
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot that is solved
@@ -171,16 +166,11 @@ class HeadingCorrector:
                 next(self._solving, None)
         return self._count == self._size
 
-    def close(self, filters: np.ndarray, *, end: float | None = None, record: bool = False) -> None:
-        """Close the open knot; `filters` (4, k) is after its last sample.
-
-        `end` [s] is the time of that sample, None: by the number of samples; `record`: keep the result for `collect`.
-        """
-        samples = self._knots * self._size + self._count - 1
-        self._knot_end = self._begin_s + samples / self.problem.sensor_rate_hz if end is None else end
-        n = slice(self._count)
+    def close(self, filters: np.ndarray, end: float | None = None) -> None:
+        """Close the open knot; `filters` (4, k) is after its last sample at `end` [s]; None: not collected."""
+        n, self._knot_end = slice(self._count), end
         self._solving = self._solve(self._quat_VS[n].copy(), self._accel_S[n].copy(), self._clasped[n].copy(), filters)
-        self._count, self._knots, self._records = 0, self._knots + 1, record
+        self._count = 0
         if not self._lead:
             self._apply()
 
@@ -188,29 +178,29 @@ class HeadingCorrector:
         self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray, filters: np.ndarray
     ) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
-        problem, rows, k = self.problem, slice(None, None, self.problem.stride), len(self.offset)
+        rows, k = slice(None, None, self.filter.stride), len(self.offset)
         quat_WS = rotations.multiply(self._quat_WV, quat_VS)
         sides = np.zeros((0, k, 3, 8))
-        if problem.pairs:
+        if self.filter.pairs:
             R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(-1, k, 3, 3)
             sides = self._filter_sides(R_WS, accel_S)[rows]
         lost = ~np.isfinite(accel_S).all(axis=(0, 2))
-        quat_WL = rotations.multiply(quat_WS[rows], problem.quat_SL)
+        quat_WL = rotations.multiply(quat_WS[rows], self.filter.quat_SL)
         yield
-        yield from self._filter.step(quat_WL, sides, clasped[rows], lost, filters)
-        if problem.causal:
+        yield from self.filter.step(quat_WL, sides, clasped[rows], lost, filters)
+        if self.filter.causal:
             self._update_estimate()
             self._var_at_knot = np.nan_to_num(filters[0])
-        else:
-            self._history.append((self._filter.x, self._filter.P, self._filter.process))
-            self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / problem.sensor_rate_hz)
+        elif self._knot_end is not None:
+            self._history.append((self.filter.x, self.filter.P, self.filter.process))
+            self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / self.filter.sensor_rate_hz)
 
     def _filter_sides(self, R_WS: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Return the side B (n, k, 3, 8) of each sensor at its joints, band-passed, one sample late.
 
         `R_WS` is (n, k, 3, 3), `accel_S` (n, k, 3) [m/s²], NaN where lost; where samples are lost B is of no use.
         """
-        rate_hz, accel_S = self.problem.sensor_rate_hz, np.concatenate([self._last_accel_S, accel_S])
+        rate_hz, accel_S = self.filter.sensor_rate_hz, np.concatenate([self._last_accel_S, accel_S])
         lost = ~np.isfinite(accel_S).all(axis=2)
         for i in np.flatnonzero(lost.any(axis=0)):
             accel_S[:, i] = accel_S[np.maximum.accumulate(np.where(lost[:, i], 0, np.arange(len(accel_S)))), i]
@@ -230,14 +220,14 @@ class HeadingCorrector:
         for _ in self._solving:
             pass
         self._solving = None
-        if not self.problem.causal:
+        if not self.filter.causal:
             return
         errors, covariance, segment_covariance = self._estimate
-        self._from, self._to, measured = self._to, errors.copy(), self.problem.measured
+        self._from, self._to, measured = self._to, errors.copy(), self.filter.measured
         if measured.any() and not self._corrects_measured:
             self._corrects_measured = exceed_uncertainty(self._to[None], covariance[None])
             self._to[measured] *= self._corrects_measured
-        if self._records:
+        if self._knot_end is not None:
             self._times.append(self._knot_end)
             self._history.append((self._to, covariance, segment_covariance))
         self._update_variance()
@@ -247,15 +237,15 @@ class HeadingCorrector:
         self._apply()
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._to - error) / (2.0 * np.pi))
-        self._filter.reset(error)
+        self.filter.reset(error)
         self._update_estimate()
         self._corrects_measured = True
         self._from = self._to = self._at_reset = error
         self._update_variance()
 
     def _update_estimate(self) -> None:
-        x, P = self._filter.x, self._filter.P
-        self._estimate = self._filter.estimate(x, P, self._filter.find_care(x, P))
+        x, P = self.filter.x, self.filter.P
+        self._estimate = self.filter.estimate(x, P, self.filter.find_care(x, P))
 
     def _update_variance(self) -> None:
         var = np.diag(self._estimate[2])
@@ -269,16 +259,16 @@ class HeadingCorrector:
         k = len(self.offset)
         columns = zip(((k,), (k, k), (k, k)), zip(*knots, strict=True) if knots else ((), (), ()), strict=True)
         values = (np.array(values).reshape(-1, *shape) for shape, values in columns)
-        return HeadingCorrection(self.problem, np.array(self._times), *values)
+        return HeadingCorrection(self.filter, np.array(self._times), *values)
 
     def smooth(self, filters: np.ndarray, end: float) -> HeadingCorrection | None:
         """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` (4, k) after the last sample at `end` [s].
 
         None: there is no knot.
         """
-        forward, measured = self._filter, self.problem.measured
+        forward, measured = self.filter, self.filter.measured
         if self._count:
-            self.close(filters, end=end)
+            self.close(filters, end)
         if not self._times:
             return None
         x, P, process = self._history[-1]

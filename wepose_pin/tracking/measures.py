@@ -8,16 +8,14 @@ lengths, and the headings of segments, whose correlations go to the parts of the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel, BodyTable
 from ..body.kinematics import Pose
-from ..body.links import compute_axis_std, compute_point_covariances
+from ..body.links import compute_point_covariances
 from ..body.subject import Subject
-from ..filters import Orientation
 from ..recording import OrientationSensor, Recording
 from ..recording.faults import find_saturation
 from ..recording.gaps import find_runs
@@ -31,51 +29,13 @@ PERIOD_S = 1.0  # [s] from one sample of the error budget to the next
 SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"
 
 
-class Signal(NamedTuple):
-    """One sensor's signal."""
-
-    rate: np.ndarray  # (n,) [rad/s], how fast it turns
-    cut: np.ndarray  # (n,) bool, an axis is cut off at the end of its range
-    gap: np.ndarray  # (n,) bool, bridged over a long gap
-    static: np.ndarray | None  # (n,) bool by the filter's test; None for measured orientations
-    gravity: float  # [m/s²]
-    bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
-
-
-class TipMotion(NamedTuple):
-    """The motion of a point whose path is drawn, as of a hand."""
-
-    reach: np.ndarray  # (n, 3) [m] from the origin of its limb, in the segment on which that hangs; NaN: not known
-    std: np.ndarray | None  # (n,) [m], one axis, from the root; None where the filter has no covariance
-    peak_speed: float  # [m/s]
-
-
-def measure_signal(
-    recording: Recording, name: str, orientation: Orientation | None, static: np.ndarray | None, every: int
-) -> Signal:
-    """Measure the signal of a sensor, with the results of its filter.
-
-    Parameters
-    ----------
-    recording, static : with all samples, static (n,) bool
-    every : samples that are shown as one: as their fastest, and as what any of them is, or all are static
-    """
+def measure_signal(recording: Recording, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Measure how fast a sensor turns (n,) [rad/s], and where an axis is cut off at the end of its range (n,) bool."""
     sensor = recording.sensors[name]
-    bins = np.arange(0, len(recording), every)
-    nothing = np.zeros(len(recording), dtype=bool)
-    gap = np.logical_or.reduceat(sensor.gap if sensor.gap is not None else nothing, bins)
-    if isinstance(sensor, OrientationSensor) or orientation is None or static is None:
-        rate = np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1)
-        return Signal(np.maximum.reduceat(rate, bins), nothing[bins], gap, None, float("nan"), None)
+    if isinstance(sensor, OrientationSensor):
+        return np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1), np.zeros(len(recording), dtype=bool)
     cut = find_saturation(sensor.gyro_S, NARROWEST_GYRO_RANGE) | find_saturation(sensor.accel_S, NARROWEST_ACCEL_RANGE)
-    return Signal(
-        np.maximum.reduceat(np.linalg.norm(sensor.gyro_S, axis=1), bins),
-        np.logical_or.reduceat(cut.any(axis=1), bins),
-        gap,
-        np.logical_and.reduceat(static, bins),
-        orientation.noise.gravity,
-        (orientation.noise.gyro_bias, orientation.gyro_bias[-1]),
-    )
+    return np.linalg.norm(sensor.gyro_S, axis=1), cut.any(axis=1)
 
 
 def compute_heading_stds(tracked: TrackResult) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -133,9 +93,12 @@ def measure_hinge(
     return bend, flexion, np.arcsin(np.clip(moves @ axis, -1.0, 1.0))
 
 
-def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipMotion]:
-    """Point whose path is drawn → its motion; only points that are known."""
-    tips = {}
+def measure_reach(pose: Pose, table: BodyTable) -> dict[str, np.ndarray]:
+    """Measure the reach (n, 3) [m] of each point whose path is drawn, as of a hand; only of points that are known.
+
+    It is from the origin of its limb, in the segment on which that hangs; NaN: not known.
+    """
+    reaches = {}
     for name, limb in table.drawn_limbs.items():
         if not {name, *limb.origin} <= set(pose.points) or (limb.base is not None and limb.base not in pose.quat_WL):
             continue
@@ -145,13 +108,16 @@ def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipM
             quat = np.where(known[:, None], pose.quat_WL[limb.base], [0.0, 0.0, 0.0, 1.0])
             reach = Rotation.from_quat(quat).inv().apply(reach)
             reach[~known] = np.nan
-        if not np.isfinite(reach).all(axis=1).any():
-            continue
-        size = max(1, round(PEAK_OVER_S * rate_hz))
-        peak = float(np.nan_to_num(np.linalg.norm(reach[size:] - reach[:-size], axis=1)).max(initial=0.0))
-        std = compute_axis_std(pose.point_cov[name]) if name in pose.point_cov else None
-        tips[name] = TipMotion(reach, std, peak * rate_hz / size)
-    return tips
+        if np.isfinite(reach).all(axis=1).any():
+            reaches[name] = reach
+    return reaches
+
+
+def compute_peak_speed(reach: np.ndarray, rate_hz: float) -> float:
+    """Compute the highest speed [m/s] of a point's reach (n, 3) [m], each the mean over `PEAK_OVER_S`."""
+    size = max(1, round(PEAK_OVER_S * rate_hz))
+    peak = float(np.nan_to_num(np.linalg.norm(reach[size:] - reach[:-size], axis=1)).max(initial=0.0))
+    return peak * rate_hz / size
 
 
 def find_samples_after_start(tracked: TrackResult) -> np.ndarray:

@@ -41,7 +41,7 @@ from ..filters.static import StaticTest
 from ..recording import ImuSensor, Recording, Sensor, join_recordings
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
-from .heading_problem import CLASP, HeadingProblem, make_heading_problem
+from .heading_filter import CLASP, HeadingFilter
 from .headings import E_Z, HeadingCorrection, HeadingCorrector
 from .result import TrackResult
 from .segment_orientations import (
@@ -193,8 +193,8 @@ class Tracker:
 
     # Orientations of segments ----------------------------------------------------------------------------------------
 
-    def _begin(self, first: Recording) -> tuple[Mapping[str, Orientation], HeadingProblem | None]:
-        """Filter and align the first chunk; return what its filters state, and what observes its headings."""
+    def _begin(self, first: Recording) -> Mapping[str, Orientation]:
+        """Filter and align the first chunk."""
         collect_nominal_mounts(first, self._subject, self._start_pose)  # an error before anything is filtered
         sways = not self._body.table.is_mechanism
         self._filters, filtered = start_filters(first, method=self._method, static_test=self._static_test, sways=sways)
@@ -216,25 +216,32 @@ class Tracker:
         self.quat_WL = np.zeros((k, 4))
         # [rad²] `HeadingCorrector.variance` at the last step; NaN: the heading's variance is that of its filter
         self._variance = np.full((3, k), np.nan)
-        if not self._observes_headings or any(sensor.aligned for sensor in first.sensors.values()):
-            return filtered.orientation, None
-        noises = {name: each.noise for name, each in filtered.orientation.items()}
-        quat_LS = dict(zip(self.names, self._quat_LS, strict=True))
-        problem = make_heading_problem(first, quat_LS, noises, self._person, self._body, causal=self._causal)
-        return filtered.orientation, problem
+        return filtered.orientation
+
+    def _observe_headings(
+        self, first: Recording, orientation: Mapping[str, Orientation], states: tuple[np.ndarray, ...]
+    ) -> int:
+        """Let headings be corrected where something observes them; return the first sample after the start pose."""
+        begin = int(np.searchsorted(first.time, self._start[1], side="right"))
+        noises, quat_LS = (
+            {name: each.noise for name, each in orientation.items()},
+            dict(zip(self.names, self._quat_LS, strict=True)),
+        )
+        known = _describe_headings(*(values[:begin] for values in states))
+        heading_filter = HeadingFilter(first, quat_LS, noises, self._person, self._body, known, causal=self._causal)
+        if heading_filter.is_observed:
+            self._headings = HeadingCorrector(heading_filter, self._heading_offset.copy())
+            self._variance = self._headings.variance if self._causal else self._variance
+        return begin
 
     def _place(self, chunk: Recording) -> _Placed:
         """Filter a chunk and place its segments, with headings that are corrected causally."""
-        orientation, problem = (self._filters.push(chunk), None) if self.names else self._begin(chunk)
-        n, begin, states = len(chunk), 0, self._stack(chunk, orientation)
+        is_first, begin = not self.names, 0
+        orientation = self._begin(chunk) if is_first else self._filters.push(chunk)
+        n, states = len(chunk), self._stack(chunk, orientation)
         quat_VS, attitude_cov = states[:2]
-        if problem is not None:  # headings are observed from the first sample after the start pose on
-            begin = int(np.searchsorted(chunk.time, self._start[1], side="right"))
-            known = _describe_headings(*(values[:begin] for values in states))
-            time = float(chunk.time[0]) + begin / self._rate_hz
-            self._headings = HeadingCorrector(problem, self._heading_offset.copy(), known, time)
-            if self._causal:
-                self._variance = self._headings.variance
+        if is_first and self._observes_headings and not any(each.aligned for each in chunk.sensors.values()):
+            begin = self._observe_headings(chunk, orientation, states)
         quat_WL, offset = np.empty(quat_VS.shape), np.empty(quat_VS.shape[:2])
         variance = np.empty((*offset.shape, 3))
         size = max(1, round(RESET_S * self._rate_hz))
@@ -257,7 +264,7 @@ class Tracker:
                 if headings is not None:
                     if headings.push(quat_VS[rows], accel_S[rows], clasped[rows]):
                         knot_end = _describe_headings(*(values[rows] for values in states))
-                        headings.close(knot_end, end=float(chunk.time[stop - 1]), record=True)
+                        headings.close(knot_end, float(chunk.time[stop - 1]))
                     if self._causal:
                         self._variance = headings.variance
                 first = stop
