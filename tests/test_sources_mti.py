@@ -1,4 +1,4 @@
-"""MTi sensors on pseudo-terminals: configured, read, lost and found again; frames as the protocol describes them."""
+"""MTi sensors on pseudo-terminals: read, lost and found again; frames as the protocol describes them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from wepose_pin.live.sources import mti, open_source
 
 serial = pytest.importorskip("serial")
 GYRO, ACCEL = [0.25, -1.5, 3.125], [-0.5, 9.8125, 0.0625]
+VECTORS = struct.pack("!fff", *GYRO), struct.pack("!fff", *ACCEL)
 
 
 def whole(mid: int, data: bytes) -> bytes:
@@ -34,19 +35,11 @@ def item(kind: int, data: bytes) -> bytes:
 
 
 class Device:
-    """An MTi at the other end of a line: answers what it is asked, and streams while it measures.
+    """An MTi at the other end of a line, which streams while it measures; `link` is the port, a symbolic link."""
 
-    Parameters
-    ----------
-    link : where the port is found, a symbolic link
-    most : rate [Hz] of each item, at most; what is asked beyond is cut down to it
-    """
-
-    def __init__(self, link: Path, most: dict[int, int] | None = None, streaming: bool = False) -> None:
-        self.link, self.most = link, most or {0x4020: 100, 0x8020: 100}
-        self.measuring, self.deaf = streaming, False
-        self.items: list[tuple[int, int]] = [(0x4020, 100), (0x8020, 100)]
-        self.asked: list[tuple[int, bytes]] = []
+    def __init__(self, link: Path, rate: int = 100) -> None:
+        self.link, self.rate = link, rate
+        self.measuring = self.deaf = False
         self.ticks = 0
         self.packet, self.noise = b"", lambda: b""  # of its own, and between all
         self._stop = threading.Event()
@@ -70,20 +63,17 @@ class Device:
         self.link.unlink()
 
     def _run(self) -> None:
-        due, inbox = time.monotonic(), b""
+        due = time.monotonic()
         while not self._stop.is_set():
             if select.select([self.master], [], [], 0.002)[0]:
-                inbox += os.read(self.master, 4096)
-                while len(inbox) >= 5 and len(inbox) >= 5 + inbox[3]:
-                    self._answer(inbox[2], inbox[4 : 4 + inbox[3]])
-                    inbox = inbox[5 + inbox[3] :]
-            rate = max(rate for _, rate in self.items)
+                asked = os.read(self.master, 4096)
+                self.measuring = self.measuring or (whole(0x10, b"") in asked and not self.deaf)
+                self._write(whole(0x11, b""))
             while self.measuring and due <= time.monotonic():
-                due += 1.0 / rate
-                self.ticks += 10_000 // rate
+                due += 1.0 / self.rate
+                self.ticks += 10_000 // self.rate
                 data = item(0x1060, (self.ticks % 2**32).to_bytes(4, "big"))
-                for kind, _ in self.items:
-                    data += item(kind, struct.pack("!fff", *(ACCEL if kind & 0xF000 == 0x4000 else GYRO)))
+                data += item(0x4020, VECTORS[1]) + item(0x8020, VECTORS[0])
                 self._write(self.noise() + whole(0x36, self.packet or data))
             if not self.measuring:
                 due = time.monotonic()
@@ -91,19 +81,6 @@ class Device:
     def _write(self, data: bytes) -> None:
         with contextlib.suppress(BlockingIOError):  # nobody reads
             os.write(self.master, data)
-
-    def _answer(self, mid: int, data: bytes) -> None:
-        self.asked.append((mid, data))
-        if self.deaf:
-            return
-        self.measuring = mid == 0x10 or (self.measuring and mid != 0x30)
-        if mid == 0xC0:
-            pairs = list(struct.iter_unpack("!HH", data))
-            pairs = [(kind, rate if rate == 0xFFFF else min(rate, self.most.get(kind, 0))) for kind, rate in pairs]
-            self.items = [(kind, rate) for kind, rate in pairs if rate != 0xFFFF]
-            self._write(whole(0xC1, b"".join(struct.pack("!HH", *pair) for pair in pairs)))
-            return
-        self._write(whole(mid + 1, b""))
 
 
 Plug = Callable[..., Device]
@@ -113,8 +90,8 @@ Plug = Callable[..., Device]
 def plugged(tmp_path: Path) -> Iterator[Plug]:
     devices: list[Device] = []
 
-    def plug(name: str, most: dict[int, int] | None = None, streaming: bool = False) -> Device:
-        devices.append(Device(tmp_path / name, most, streaming))
+    def plug(name: str, rate: int = 100) -> Device:
+        devices.append(Device(tmp_path / name, rate))
         return devices[-1]
 
     yield plug
@@ -123,17 +100,14 @@ def plugged(tmp_path: Path) -> Iterator[Plug]:
             device.pull()
 
 
-def test_two_sensors_configured_to_a_rate(plugged: Plug) -> None:
-    one, two = plugged("one", streaming=True), plugged("two")
+def test_two_sensors(plugged: Plug) -> None:
+    one, two = plugged("one", 50), plugged("two", 50)
     begin = time.monotonic()
-    with connected(f"mti:{one.link}=torso,{two.link}=head@50") as source:
+    with connected(f"mti:{one.link}=torso,{two.link}=head") as source:
         assert source.sensors == ("torso", "head")
-        assert source.rate_hz == 50
         assert source.describe_awaited() == f"MTi sensors: torso at {one.link}, head at {two.link}"
         samples = collect(source, 40, sensors=2)
-    for device, name in ((one, "torso"), (two, "head")):
-        assert [mid for mid, _ in device.asked] == [0x30, 0xC0, 0x10]
-        assert device.asked[1][1] == bytes.fromhex("1060FFFF4020003280200032")
+    for name in ("torso", "head"):
         np.testing.assert_array_equal(samples[name].gyro_S, np.tile(GYRO, (len(samples[name].time), 1)))
         np.testing.assert_array_equal(samples[name].accel_S, np.tile(ACCEL, (len(samples[name].time), 1)))
         assert np.median(np.diff(samples[name].time)) == pytest.approx(0.02, rel=0.0101)
@@ -141,26 +115,11 @@ def test_two_sensors_configured_to_a_rate(plugged: Plug) -> None:
     assert source.problems == {}
 
 
-def test_the_rates_that_a_device_has(plugged: Plug) -> None:
-    """100 Hz where none is named."""
-    device, plain = plugged("one"), plugged("two", most={0x4020: 400, 0x8020: 400})
-    with connected(f"mti:{plain.link}=torso@400") as source:
-        assert plain.items == [(0x4020, 400), (0x8020, 400)]
-        samples = collect(source, 200)["torso"]
-    assert np.median(np.diff(samples.time)) == pytest.approx(0.0025, rel=0.0101)
-    with connected(f"mti:{plain.link}=torso"):
-        assert plain.items == [(0x4020, 100), (0x8020, 100)]
-    source = open_source(f"mti:{device.link}=torso@200")
-    source.open()
-    wait_until(lambda: source.describe_awaited().endswith("it has no 200 Hz; it offers 100 Hz: write @100"))
-    source.close()
-
-
 def test_a_port_that_vanishes_is_taken_up_again(plugged: Plug) -> None:
-    """The other sensor goes on; the one that comes back is configured anew, its clock begins anew."""
+    """The other sensor goes on; the clock of the one that comes back begins anew."""
     gone, stays = plugged("one"), plugged("two")
     begin = time.monotonic()
-    with connected(f"mti:{gone.link}=torso,{stays.link}=head@100") as source:
+    with connected(f"mti:{gone.link}=torso,{stays.link}=head") as source:
         collect(source, 20, sensors=2)
         gone.pull()
         wait_until(lambda: source.read(0.1) and source.problems.get("connections lost to torso"))
@@ -170,13 +129,12 @@ def test_a_port_that_vanishes_is_taken_up_again(plugged: Plug) -> None:
         samples = collect(source, 20, sensors=2)["torso"]
         assert len(samples.time) >= 20
         assert begin < samples.time[-1] < source.clock() + 1.0
-        assert [mid for mid, _ in gone.asked] == [0x30, 0xC0, 0x10] * 2
 
 
 def test_a_device_that_falls_silent_is_woken(plugged: Plug, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mti, "SILENT_S", 0.2)
     device = plugged("one")
-    with connected(f"mti:{device.link}=torso@100") as source:
+    with connected(f"mti:{device.link}=torso") as source:
         collect(source, 20)
         device.measuring = False  # its supply failed, it starts in config state, the port stays
         while source.read(0.1):
@@ -187,19 +145,20 @@ def test_a_device_that_falls_silent_is_woken(plugged: Plug, monkeypatch: pytest.
 def test_a_port_is_waited_for_and_what_is_wrong_is_said(
     tmp_path: Path, plugged: Plug, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mti, "ANSWER_S", 0.05)
+    monkeypatch.setattr(mti, "SILENT_S", 0.2)
     before = set(threading.enumerate())
-    source = open_source(f"mti:{tmp_path / 'one'}=torso@100")
+    source = open_source(f"mti:{tmp_path / 'one'}=torso")
     place = f"the MTi of torso at {tmp_path / 'one'}: "
     source.open()
     wait_until(lambda: source.describe_awaited() == f"{place}cannot open the port (No such file or directory)")
     assert not source.connect(0.1)
     device = plugged("one")
     device.deaf = True
-    wait_until(lambda: source.describe_awaited().startswith(f"{place}no MTi answers at 115200 baud"))
-    device.deaf = False
+    wait_until(lambda: source.describe_awaited().startswith(f"{place}nothing comes at 115200 baud"))
+    device.packet, device.deaf = item(0x1060, bytes(4)) + item(0x8020, VECTORS[0]), False
+    wait_until(lambda: source.describe_awaited().startswith(f"{place}no packets with SampleTimeFine, RateOfTurn"))
+    device.packet = b""
     source.close()
-    monkeypatch.setattr(mti, "ANSWER_S", 0.5)
     for _ in range(2):  # the port is free again after each
         with connected(source):
             assert collect(source, 5)
@@ -214,7 +173,7 @@ def test_frames_come_out_of_noise(plugged: Plug) -> None:
     rng, device = np.random.default_rng(3), plugged("one")
     bad = whole(0x36, bytes(20))
     device.noise = lambda: rng.bytes(9) + bad[:-1] + bytes([bad[-1] ^ 1]) + b"\xfa\xff\x36\x05"
-    with connected(f"mti:{device.link}=torso@100") as source:
+    with connected(f"mti:{device.link}=torso") as source:
         torso = collect(source, 50)["torso"]
         assert len(torso.time) >= 50
         assert (torso.gyro_S == GYRO).all()
@@ -230,13 +189,10 @@ def test_a_packet_of_a_device(plugged: Plug) -> None:
         "8030103F80000037DF8801B6898000B608C000C0200CBEFBFBF23F33C485BFA0A2C108100442168000"
         "301004000186E1E0200400400003"
     )
-    with connected(f"mti:{device.link}=torso@100") as source:
+    with connected(f"mti:{device.link}=torso") as source:
         torso = collect(source, 1)["torso"]
     np.testing.assert_allclose(torso.gyro_S[0], [0.02131760, -0.00327826, -0.00163019], atol=1e-8)
     np.testing.assert_allclose(torso.accel_S[0], [-0.05550629, 9.81465530, 0.21842313], atol=1e-8)
-
-
-VECTORS = struct.pack("!fff", *GYRO), struct.pack("!fff", *ACCEL)
 
 
 @pytest.mark.parametrize(
@@ -248,9 +204,9 @@ VECTORS = struct.pack("!fff", *GYRO), struct.pack("!fff", *ACCEL)
         b"\x80",
     ],
 )
-def test_a_packet_that_was_not_asked_for_is_no_sample(packet: bytes, plugged: Plug) -> None:
+def test_a_packet_without_a_sample_is_counted(packet: bytes, plugged: Plug) -> None:
     device = plugged("one")
-    with connected(f"mti:{device.link}=torso@100") as source:
+    with connected(f"mti:{device.link}=torso") as source:
         collect(source, 5)
         device.packet = packet
         wait_until(lambda: source.read(0.05) is not None and source.problems)

@@ -98,7 +98,6 @@ def test_measured_orientations_come_as_six_numbers() -> None:
         ("mti:/dev/ttyUSB0", {}, "'/dev/ttyUSB0' is no DEVICE=SEGMENT"),
         ("mti:/dev/ttyUSB0=trso", {}, "did you mean 'torso'"),
         ("mti:/dev/a=torso,/dev/a=head", {}, "'/dev/a=head': each device"),
-        ("mti:/dev/a=torso@fast", {}, "rate 'fast'"),
         ("mti:/dev/a=torso", {"sensors": ["head"]}, "no device for head"),
         ("udp:9000", {"sensors": ["trunk"]}, "'trunk' is not a segment"),
         ("udp:9000,gyro_unit=rpm", {}, "gyro_unit 'rpm' is not known; there is: rad/s, deg/s"),

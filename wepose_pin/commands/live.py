@@ -138,8 +138,7 @@ def live(
         With --guide: use this measured length, such as shoulder_width=0.385; may be given several times.
     protocol
         With --guide: calibrate by this protocol, as `wepose calibrate`. Without it clasp+t_pose, and a bow after them
-        for sensors that measure orientations and no accelerations where no session states the torso's mount. All but
-        the first part may be skipped.
+        for sensors that measure orientations and no accelerations where no session states the torso's mount.
     host
         Serve the page on this address of this machine, such as 0.0.0.0 for all, to open it on a phone. Its URL then
         holds a token, without which nobody can open it. Without --host this machine alone can open the page.

@@ -6,7 +6,7 @@ Outputs load when they are used: `page` for the browser, `terminal`, `outputs` f
 from __future__ import annotations
 
 from .loop import LiveLoop, SessionSummary, run_session
-from .setup import SensorSetup, find_setup, read_setup
+from .setup import SensorSetup, find_setup
 from .sources import open_source
 from .state import LivePose, Output, Request, SensorStatus, Status, StreamInfo
 
@@ -22,6 +22,5 @@ __all__ = [
     "StreamInfo",
     "find_setup",
     "open_source",
-    "read_setup",
     "run_session",
 ]

@@ -59,7 +59,7 @@ class GuideOptions:
     folder: Path  # where recordings, calibrations and the sensors' setup go
     setup: SensorSetup  # name, start pose and body of the session; its mounts, where known
     model: BodyModel
-    protocol: str  # all but the first of joined parts may be skipped
+    protocol: str
     method: str = BEST
     measured: Mapping[str, float] = field(default_factory=dict)
     stature: float | None = None
@@ -70,12 +70,6 @@ class GuideOptions:
     @cached_property
     def joined(self) -> Protocol:
         return load_protocol(self.protocol)
-
-    @property
-    def optional(self) -> set[str]:
-        """Phases of the protocol that may be skipped."""
-        later = [load_protocol(part) for part in split_protocol(self.protocol)[1:]]
-        return {step.phase for part in later for step in part.steps if step.phase != "start"}
 
     def calibrate(self, source: Recording | Path, entered: Mapping[str, float] = MappingProxyType({})) -> Calibration:
         """Calibrate a recording, with lengths [m] that the person has `entered`; that of a file is saved beside it."""
@@ -105,7 +99,7 @@ def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str
 
 
 def choose_parts(protocol: str, phases: Collection[str]) -> str:
-    """Choose the parts of a joined protocol whose phases are there, all where none is: a part may be skipped."""
+    """Choose the parts of a joined protocol whose phases are there, all where none is: others are still to come."""
     parts = [part for part in split_protocol(protocol) if {s.phase for s in load_protocol(part).steps} <= {*phases}]
     return "+".join(parts) or protocol
 
@@ -144,7 +138,6 @@ class Guide(Stage):
         self.attempt: Attempt | None = None  # the recording; None before it begins
         self.measured: dict[str, float] = {}  # lengths [m] that the person entered
         self.reason = ""  # for which the person must begin again from the start pose
-        self.skipped = set[str]()  # steps
         self.accepted: Calibration | None = None
         self._postponed: list[Samples] = []  # that came while an attempt is evaluated
         self._index = 0
@@ -210,7 +203,6 @@ class Guide(Stage):
         """Begin the step of this name, "": the next one; where sensors may change, a new attempt begins after it."""
         while True:
             self._index = [step.name for step in self.steps].index(name) if name else self._index + 1
-            self.skipped.discard(self.step.name)
             if self.step.before_attempt:
                 self.close()
             self.ticks, self._running = [], self.step.run(self, bool(name))
@@ -249,11 +241,8 @@ class Guide(Stage):
 
     def view(self) -> GuideView:
         states = ["done"] * self._index + ["now"] + ["ahead"] * (len(self.steps) - self._index - 1)
-        steps = [
-            GuideStep(step.name, step.title, "skipped" if step.name in self.skipped else state)
-            for step, state in zip(self.steps, states, strict=True)
-        ]
-        return self._view._replace(steps=tuple(steps))
+        steps = tuple(GuideStep(step.name, step.title, state) for step, state in zip(self.steps, states, strict=True))
+        return self._view._replace(steps=steps)
 
     def build_status(self) -> Status:
         sensors = []
@@ -290,22 +279,11 @@ class Attempt:
         self._header = setup.header(source.sensors, source.orientations) | {"method": options.method}
         self.path, self._source, self.log = path, source, LiveLog(path, self._header)
         self.stream = TickStream(source, self.log)
-        self._markers, self._ticks = Markers(), list[Ticks]()
-
-    @property
-    def newest(self) -> float:
-        """Time [s] of the newest tick; 0 before the first."""
-        return float(self._ticks[-1].time[-1]) if self._ticks else 0.0
-
-    @property
-    def segments(self) -> dict[str, str]:
-        """Sensor by the name in the file → its segment, in the order of the ticks' columns."""
-        return {name: self._markers.segments.get(name, name) for name in self._source.sensors}
+        self._markers = Markers()
 
     def push(self, samples: Sequence[Samples]) -> list[Ticks]:
         """Record samples of the source; return the ticks that they complete."""
         ticks = [*self.stream.push(self._source.rename(samples))]
-        self._ticks += ticks
         self.log.flush_if_due()
         return ticks
 
@@ -319,11 +297,11 @@ class Attempt:
 
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
-        header = self._header | {"sensors": [*self.segments.values()], "phases": self._phases()}
-        return check_recording(build_recording(header, self.stream.clock.rate_hz, self._ticks, None, self.path))
+        header = self._header | {"phases": self._phases()}
+        return check_recording(build_recording(header, self.stream.clock.rate_hz, self.stream.ticks, None, self.path))
 
     def _phases(self) -> dict[str, Any]:
-        return self._markers.phases(float(self._ticks[0].time[0]), self.newest) if self._ticks else {}
+        return self._markers.phases(self.stream.clock.begin, self.stream.newest) if self.stream.ticks else {}
 
 
 class Demonstration:

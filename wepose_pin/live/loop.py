@@ -20,7 +20,7 @@ from ..body.configuration import KinematicsSolver
 from ..body.links import compute_axis_std
 from ..body.mounts import compute_start_configuration
 from ..body.soft_tissue import make_correction
-from ..body.subject import parse_subject, subject_toml
+from ..body.subject import parse_subject
 from ..body.table import check_segments
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
@@ -83,11 +83,10 @@ class LiveLoop(Stage):
     ) -> None:
         super().__init__(source, outputs)
         check_mounts(source, setup)
-        subject_text = None if setup.subject is None else subject_toml(setup.subject)
-        if subject_text is not None:  # as a reader of the recording gets it, with the decimals of its text
-            setup = replace(setup, subject=parse_subject(subject_text, Path("subject.toml")))
-        self.setup = setup
-        self.model = build_subject_model(setup, source.sensors, model)
+        self._header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
+        if setup.subject is not None:  # as a reader of the recording gets it, with the decimals of its text
+            setup = replace(setup, subject=parse_subject(self._header["subject"], Path("subject.toml")))
+        self.setup, self.model = setup, build_subject_model(setup, source.sensors, model)
         check_segments(self.model.table, source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
             _ = self.model.reaches
@@ -96,16 +95,14 @@ class LiveLoop(Stage):
         self._correct_soft_tissue = make_correction(self.model, tuple(source.sensors))
         self._correct_soft_tissue(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
         self._tracker = Tracker(setup.subject, model=self.model, method=method, causal=True)
-        self._estimator: Tracker | None = None  # from when the start pose is found
-        self._header = setup.header(source.sensors, source.orientations)
-        further = {"method": method, "subject": subject_text, "versions": versions()}
-        self.log = LiveLog(None if record is None else Path(record), self._header | further, force)
+        self._is_tracking = False  # True from when the start pose is found
+        self.log = LiveLog(None if record is None else Path(record), self._header, force)
         self._monitor, self._stream = SensorMonitor(source), TickStream(source, self.log)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
         # Where stated phases begin (True) and end, in order of time; a phase holds its first second and its last.
-        spans = [(name, first, last) for name, spans in setup.phases.items() for first, last in spans]
-        edges = [(first - 1e-9, name, True) for name, first, _ in spans]
-        self._edges = deque(sorted(edges + [(last + 1e-9, name, False) for name, _, last in spans]))
+        spans = [(name, *span) for name, spans in setup.phases.items() for span in spans]
+        edges = [edge for name, t0, t1 in spans for edge in ((t0 - 1e-9, name, True), (t1 + 1e-9, name, False))]
+        self._edges = deque(sorted(edges))
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._latency: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s]
         self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
@@ -161,6 +158,8 @@ class LiveLoop(Stage):
         self._monitor.push(samples)
         for ticks in self._stream.push(samples):
             pose = self._track(ticks) or pose
+            if self._is_tracking:
+                self._stream.ticks.clear()
         self.log.flush_if_due()  # before it is shown: a pose that others know is in the file soon
         if pose is not None:
             for output in self.outputs:
@@ -168,57 +167,53 @@ class LiveLoop(Stage):
 
     def _track(self, ticks: Ticks) -> LivePose | None:
         """Track these ticks, log every pose, and return the last one; None before tracking starts."""
-        row, estimator, quat_WL = 0, self._estimator, None
-        if estimator is None:
+        row, quat_WL = 0, None
+        if not self._is_tracking:
             self._search = self._search or StartPoseSearch(self._stream, self.setup, self.model.table)
             start = self._search.push(ticks)
             if start is None:
                 return None
-            *start_pose, row = start
-            estimator = self._estimator = self._start_tracking(*start_pose)
+            begin, end, row = start
+            self._start_tracking(begin, end)
         for n in range(row, len(ticks.time)):
             while self._edges and self._edges[0][0] <= ticks.time[n]:
                 _, phase, begins = self._edges.popleft()
-                estimator.mark_phase(phase, begins=begins)
-            quat_WL = self._correct_soft_tissue(estimator.step(ticks.gyro_S[n], ticks.accel_S[n]))
-            self._update_std(estimator, ticks.first + n)
+                self._tracker.mark_phase(phase, begins=begins)
+            quat_WL = self._correct_soft_tissue(self._tracker.step(ticks.gyro_S[n], ticks.accel_S[n]))
+            self._update_std(ticks.first + n)
             self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:
             return None
         points = self.kinematics.compute_points(quat_WL)
-        now, self._last_pose = self.source.clock(), float(ticks.time[-1])
+        now, time_s = self.source.clock(), float(ticks.time[-1])
         self._poses += len(ticks.time) - row
         with_sample = ~ticks.lost[row:].all(axis=1)  # a tick of silent sensors is not late
         self._latency += (now - ticks.time[row:][with_sample]).tolist()
-        quat_WL = self.kinematics.orient_segments(quat_WL).copy()
-        return LivePose(
-            self._last_pose, quat_WL, points, self._std.copy(), ticks.lost[-1].copy(), now - self._last_pose
-        )
+        self._last_pose, quat_WL = time_s, self.kinematics.orient_segments(quat_WL).copy()
+        return LivePose(time_s, quat_WL, points, self._std.copy(), ticks.lost[-1].copy(), now - time_s)
 
-    def _update_std(self, estimator: Tracker, tick: int) -> None:
+    def _update_std(self, tick: int) -> None:
         """Compute the covariances of the segments whose turn it is; by ticks, so that a recording reproduces them."""
         period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))  # ticks from one turn to the next
         for i in range(len(self._std)):
             if i * period // len(self._std) == tick % period:
-                covariance = estimator.compute_covariance(i)
+                covariance = self._tracker.compute_covariance(i)
                 self._std[i], self._heading_std[i] = compute_axis_std(covariance[None])[0], np.sqrt(covariance[2, 2])
 
-    def _start_tracking(self, begin: int, end: int) -> Tracker:
-        """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
-        assert self._search is not None
+    def _start_tracking(self, begin: int, end: int) -> None:
+        """Align by the start pose, ticks `begin` to `end`."""
         rate_hz = self._stream.clock.rate_hz
-        recording = build_recording(self._header, rate_hz, self._search.ticks, (begin, end), last=end)
+        recording = build_recording(self._header, rate_hz, self._stream.ticks, (begin, end), last=end)
         diagnostics = check_units(recording, self.source)
-        estimator = self._tracker
-        estimator.push(recording)
-        self._search.ticks, self._monitor.keeps_samples = [], False
-        self._diagnostics = (*estimator.diagnostics, *diagnostics)
+        self._tracker.push(recording)
+        self._monitor.keeps_samples = False
+        self._diagnostics = (*self._tracker.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])
         self.log.event("start", begin=begin, end=end)
         info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
         for output in self.outputs:
             output.start(info)
-        return estimator
+        self._is_tracking = True
 
     # Actions ---------------------------------------------------------------------------------------------------------
 
@@ -226,7 +221,7 @@ class LiveLoop(Stage):
     def actions(self) -> tuple[Action, ...]:
         if self._end_message:
             return ()
-        if self._estimator is None or self.log.path is None:
+        if not self._is_tracking or self.log.path is None:
             return (RESET,)
         marks = [BEGIN_TAKE, BEGIN_PHASE]
         for k, action in enumerate(marks):
@@ -237,12 +232,12 @@ class LiveLoop(Stage):
     def do(self, action: Action, text: str) -> None:
         text = text[:LONGEST_TEXT]
         if action.name == RESET.name:
-            if self._estimator is not None:
-                self._estimator.reset_headings()
+            if self._is_tracking:
+                self._tracker.reset_headings()
                 self.log.event("reset", tick=self._stream.clock.next_tick)
             for output in self.outputs:
                 output.resume()
-        elif action.name in (BEGIN_TAKE.name, BEGIN_PHASE.name) and self._estimator is not None:
+        elif action.name in (BEGIN_TAKE.name, BEGIN_PHASE.name):
             begins = action.name not in self._open_phases
             if begins:
                 self._takes += action.name == BEGIN_TAKE.name
@@ -253,14 +248,14 @@ class LiveLoop(Stage):
             # It begins with the next tick: the ticks before have been tracked without it.
             time_s = self._stream.newest + (1.0 / self._stream.clock.rate_hz if begins else 0.0)
             self.log.event("begin" if begins else "end", phase=phase, time=time_s)
-            self._estimator.mark_phase(phase, begins=begins)
+            self._tracker.mark_phase(phase, begins=begins)
         else:
             self.log.event("mark", text=text or "mark", time=self._stream.newest)
 
     # The state -------------------------------------------------------------------------------------------------------
 
     def build_status(self) -> Status:
-        sensors, estimator, clock = self.source.sensors, self._estimator, self._stream.clock
+        sensors, tracker, clock = self.source.sensors, self._tracker, self._stream.clock
         now, counts, frozen = self.source.clock(), clock.counts, clock.frozen.copy()
         rates = self._monitor.update(now)
         lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen | clock.lost
@@ -269,8 +264,8 @@ class LiveLoop(Stage):
             status = SensorStatus(name, rates.get(name, 0.0), bool(lost[i]), frozen=bool(frozen[i]))
             if self._stream.has_begun:
                 status = status._replace(missing=int(counts[i, MISSING]))
-            if estimator is not None:
-                static, bias = bool(estimator.static[i]), tuple(estimator.gyro_bias[i].tolist())
+            if self._is_tracking:
+                static, bias = bool(tracker.static[i]), tuple(tracker.gyro_bias[i].tolist())
                 status = status._replace(static=static, gyro_bias=bias, heading_std=float(self._heading_std[i]))
             statuses.append(status)
             if counts[i, CUT_OFF]:
@@ -289,7 +284,7 @@ class LiveLoop(Stage):
         names = np.array(self.source.sensors, dtype=object)
         silent, repeats = list(names[lost & ~frozen]), list(names[frozen])
         repeated = f"Repeated values from {join_names(repeats)}: switch it off and on." if repeats else ""
-        if self._estimator is not None:
+        if self._is_tracking:
             sentences = [f"No samples from {join_names(silent)}." if silent else "", repeated]
             sentences = [sentence for sentence in sentences if sentence] or ["Tracking."]
             return "ready", " ".join(filter(None, sentences + [each.describe() for each in self.outputs])), 1.0

@@ -37,7 +37,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from ..body import BodyModel
 from ..body.configuration import KinematicsSolver
-from ..body.links import find_known_links, find_known_points
+from ..body.links import find_known_links
 from ..errors import BadOption
 from ..report.viewer import DARK, LIGHT, Mesh, backdrop, choose_trail_colour, filled, find_floor, scene, view, visible
 from ..retargeting.placement import place_beside_person
@@ -102,7 +102,7 @@ class LivePage(Output):
         self, model: BodyModel, robot: Robot | None = None, position: Callable[[], np.ndarray | None] = lambda: None
     ) -> None:
         """Draw this body from now on, and a robot beside it at its joint `position`; browsers load the page again."""
-        encoder = PoseEncoder(model, None if robot is None else RobotFigure(robot, model, position))
+        encoder = PoseEncoder(model, robot, position)
         self.html, self.encoder = _fill_page(model, encoder, self._title), encoder
 
     def demonstrate(self, pose: LivePose, info: StreamInfo) -> None:
@@ -174,44 +174,41 @@ class LivePage(Output):
         return self._encoded[1]
 
 
-class RobotFigure:
-    """A robot drawn beside the person, at the joint positions that `position` gives now; None: those at rest."""
-
-    def __init__(self, robot: Robot, model: BodyModel, position: Callable[[], np.ndarray | None]) -> None:
-        parts = build_parts(robot)
-        data = place_n_pose(model)
-        shoulders = [find_person_arm(model.table, arm.side).points[0] for arm in robot.arms]
-        heights = [data.oMf[model.pin.getFrameId(model.point_frames[point])].translation[2] for point in shoulders]
-        self._robot, self._position = robot, position
-        self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
-        self._joints = sorted({part.joint for part in parts})
-        self._data = robot.model.createData()
-        self.links = tuple(f"robot {joint}" for joint in self._joints)  # one for each moving part, and its mesh
-        self.meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
-
-    def place(self) -> np.ndarray:
-        """Rotation row by row and position [m] of each link in W, (links, 12)."""
-        position = self._position()
-        configuration = self._robot.configuration(self._robot.rest if position is None else position)
-        pin.forwardKinematics(self._robot.model, self._data, configuration)
-        return _stack([self._root * self._data.oMi[joint] for joint in self._joints])
-
-
 class PoseEncoder:
-    """Encodes poses for the page, with the robot beside the person if there is one."""
+    """Encodes poses for the page, and beside the person a robot at the joint positions that `position` gives now.
 
-    def __init__(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
+    Where that is None, the robot is at rest.
+    """
+
+    def __init__(
+        self, model: BodyModel, robot: Robot | None = None, position: Callable[[], np.ndarray | None] = lambda: None
+    ) -> None:
         self.identity = secrets.token_hex(8)  # of the page that draws its frames
-        self.visuals, self.robot = visible(model.visuals), robot
+        self.visuals = visible(model.visuals)
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
-        self.links = self.body_links + (() if robot is None else robot.links)  # in the order of the frames
         self.newest: LivePose | None = None  # to draw; None: the N-pose
         self.info: StreamInfo | None = None  # of the poses; None before the start
         self._model, self._lock = model, threading.Lock()  # the page encodes in a thread of its own
         self._frames = [model.pin.getFrameId(link) for link in self.body_links]
-        data = place_n_pose(model)
-        self._neutral = _stack([data.oMf[frame] for frame in self._frames])
         self._known = np.ones(len(self._frames), dtype=bool)
+        data = model.pin.createData()
+        pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
+        self.neutral = _stack([data.oMf[frame] for frame in self._frames])
+        p_W = {point: data.oMf[model.pin.getFrameId(frame)].translation for point, frame in model.point_frames.items()}
+        draw, self.reach = model.table.draw, [np.zeros((1, 3))]  # points [m] that the camera has to see
+        for first, *_, last in draw.limbs:  # in front, at the sides and up
+            if last in draw.paths:
+                self.reach.append(p_W[first] + (np.linalg.norm(p_W[last] - p_W[first]) + FINGERS) * DIRECTIONS)
+        self._robot, self._position = robot, position
+        self._robot_joints, self.meshes = list[int](), list[Mesh]()
+        if robot is not None:
+            parts = build_parts(robot)
+            heights = [p_W[find_person_arm(model.table, arm.side).points[0]][2] for arm in robot.arms]
+            self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
+            self._robot_joints, self._robot_data = sorted({part.joint for part in parts}), robot.model.createData()
+            self.meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
+            self.reach.append(self._place_robot()[:, 9:])
+        self.links = self.body_links + tuple(f"robot {joint}" for joint in self._robot_joints)  # as in the frames
 
     def start(self, info: StreamInfo) -> None:
         model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
@@ -232,7 +229,7 @@ class PoseEncoder:
 
     def encode(self, pose: LivePose | None) -> bytes:
         """The frame of a pose, None: the N-pose, as `page` describes it; NaN is what is not known."""
-        time, placements, lost = math.nan, self._neutral, np.zeros(len(self.links), dtype=bool)
+        time, placements, lost = math.nan, self.neutral, np.zeros(len(self.links), dtype=bool)
         points = np.full((len(self._model.table.draw.paths), 3), np.nan, "<f4")
         with self._lock:
             if pose is not None and self.info is not None and len(pose.quat_WL) == len(self.info.segments):
@@ -242,16 +239,16 @@ class PoseEncoder:
                     points[k] = pose.points[row] if row >= 0 else np.nan
                 lost[: len(self._sensors)] = (self._sensors >= 0) & pose.lost[self._sensors]
             placements = np.where(self._known[:, None], placements, np.float32(np.nan))
-        if self.robot is not None:
-            placements = np.concatenate([placements, self.robot.place()])
+        placements = np.concatenate([placements, self._place_robot()])
         return np.array(time, "<f8").tobytes() + placements.tobytes() + points.tobytes() + lost.tobytes()
 
-
-def place_n_pose(model: BodyModel) -> pin.Data:
-    """Pinocchio's data with the frames of the N-pose."""
-    data = model.pin.createData()
-    pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
-    return data
+    def _place_robot(self) -> np.ndarray:
+        """Rotation row by row and position [m] of each link of the robot in W, (links, 12)."""
+        if self._robot is not None:
+            position = self._position()
+            configuration = self._robot.configuration(self._robot.rest if position is None else position)
+            pin.forwardKinematics(self._robot.model, self._robot_data, configuration)
+        return _stack([self._root * self._robot_data.oMi[joint] for joint in self._robot_joints])
 
 
 def _stack(placements: Sequence[Any]) -> np.ndarray:
@@ -354,26 +351,17 @@ def _is_address(host: str, own: str) -> bool:
 
 def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
     """The page; its scene is the body in the N-pose, its camera sees all that the limbs can reach."""
-    links, body, robot = encoder.links, encoder.body_links, encoder.robot
-    neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(body), offset=8).reshape(-1, 12)
+    links, body = encoder.links, encoder.body_links
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(body), 1, 1)).astype("<f4")
-    motion[:, 0, 4:] = neutral[:, 9:]
-    reach, data, draw = [np.zeros((1, 3))], place_n_pose(model), model.table.draw
-    known = find_known_points(model, model.chains)
-    p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
-    for first, *_, last in draw.limbs:  # in front, at the sides and up
-        if last in draw.paths and first in p_W and last in p_W:
-            reach.append(p_W[first] + (np.linalg.norm(p_W[last] - p_W[first]) + FINGERS) * DIRECTIONS)
-    if robot is not None:
-        reach.append(robot.place()[:, 9:])
+    motion[:, 0, 4:] = encoder.neutral[:, 9:]
     backdrops = {name: backdrop(colours, find_floor(model)) for name, colours in (("light", LIGHT), ("dark", DARK))}
     content = {
         "id": encoder.identity,
         "links": list(links),
-        "scene": scene(encoder.visuals, links, () if robot is None else robot.meshes),
+        "scene": scene(encoder.visuals, links, encoder.meshes),
         "backdrops": backdrops,
-        "view": view(encoder.visuals, body, motion, reach),
-        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in draw.paths],
+        "view": view(encoder.visuals, body, motion, encoder.reach),
+        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }
     return filled("live/templates/live.html.j2", content, title or "wepose live")
 

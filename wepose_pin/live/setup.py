@@ -45,16 +45,12 @@ class SensorSetup:
 
     def header(self, sensors: Sequence[str], orientations: Mapping[str, bool] | None = None) -> dict[str, Any]:
         """Header of the recording of a live session, without the method; `orientations` as of a `Source`."""
-        return {
-            "name": self.name,
+        return {key: getattr(self, key) for key in ("name", "start_pose", "remounted", "model")} | {
+            "phases": dict(self.phases),
             "sensors": list(sensors),
             "orientations": dict(orientations or {}),
             "mounts": {name: np.asarray(quat).tolist() for name, quat in self.mounts.items() if name in sensors},
-            "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
-            "start_pose": self.start_pose,
-            "remounted": self.remounted,
             "joints": dict(self.joints),
-            "model": self.model,
             "subject": None if self.subject is None else subject_toml(self.subject),
         }
 
@@ -67,23 +63,17 @@ def find_setup(
     Raises `WeposeError` where there is no such file, or it is damaged.
     """
     setup = SensorSetup()
-    if session is not None:
-        setup = read_setup(Path(session))
+    if session is not None:  # whose data and phases belong to another recording
+        top = read_session_file(Path(session))
+        head, sensors = read_head(top), top.table("sensors")
+        stated = {segment: read_sensor_keys(sensors.table(segment), SensorKeys()).mount for segment in sensors.values}
+        mounts = {segment: mount for segment, mount in stated.items() if mount is not None}
+        setup = replace(SensorSetup.from_recording(head), mounts=mounts, phases={})
     elif isinstance(source, ReplaySource):
         setup = SensorSetup.from_recording(source.recording)
     if model is not None:
         setup = replace(setup, model=str(Path(model).absolute() if Path(model).is_file() else model))
     return replace(setup, subject=None if subject is None else load_subject(subject))
-
-
-def read_setup(path: Path) -> SensorSetup:
-    """The setup that a session file states; its data and phases belong to another recording and are ignored."""
-    top = read_session_file(path)
-    sensors = top.table("sensors")
-    stated = {segment: read_sensor_keys(sensors.table(segment), SensorKeys()).mount for segment in sensors.values}
-    head = read_head(top)
-    named = {key: getattr(head, key) for key in ("start_pose", "remounted", "joints", "model")}
-    return SensorSetup(head.name, mounts={name: mount for name, mount in stated.items() if mount is not None}, **named)
 
 
 def check_mounts(source: Source, setup: SensorSetup) -> None:

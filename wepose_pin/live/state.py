@@ -81,11 +81,11 @@ QUIT = Request("quit")
 
 
 class GuideStep(NamedTuple):
-    """A step of the guided session; one that is done or skipped is an action of this name."""
+    """A step of the guided session; one that is done is an action of this name."""
 
     name: str
     title: str
-    state: str  # "done", "skipped", "now", "ahead"
+    state: str  # "done", "now", "ahead"
 
 
 class GuideView(NamedTuple):
@@ -151,9 +151,10 @@ class Output:
 
 
 class Stage(ABC):
-    """A part of a live session, the guide or tracking: reads an open source until it ends, and shows what comes of it.
+    """A part of a live session, the guide or tracking: reads an open source until it ends; the outputs stay open.
 
-    The outputs stay open.
+    A subclass states what the person may ask for now (`actions`), does it, with the text that was typed (`do`), takes
+    the samples of one read, perhaps none (`process`), and describes the state now (`build_status`).
     """
 
     READ_TIMEOUT_S = 0.05  # [s]; requests and the status wait for a read
@@ -165,20 +166,16 @@ class Stage(ABC):
 
     @property
     @abstractmethod
-    def actions(self) -> tuple[Action, ...]:
-        """What the person may ask for now."""
+    def actions(self) -> tuple[Action, ...]: ...
 
     @abstractmethod
-    def do(self, action: Action, text: str) -> None:
-        """Do one of these, with the text that was typed for it."""
+    def do(self, action: Action, text: str) -> None: ...
 
     @abstractmethod
-    def process(self, samples: list[Samples]) -> None:
-        """Take the samples of one read, perhaps none."""
+    def process(self, samples: list[Samples]) -> None: ...
 
     @abstractmethod
-    def build_status(self) -> Status:
-        """The state now; called a few times a second."""
+    def build_status(self) -> Status: ...
 
     def ask(self, request: Request) -> None:
         """Do what the person asks for; what is not offered now is ignored."""

@@ -45,7 +45,7 @@ TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain"
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
 REMEDIES = {
     "scale-uncertain": "Measure what is asked for and enter it here.",
-    "sensors-exchanged": "Exchange them here.",
+    "sensors-exchanged": "Go back to Segments, and shake each sensor that is asked for.",
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
 
@@ -55,10 +55,8 @@ FINISH = Action("next", "Finish", "n")
 AGAIN = Action("again", "Once more", "a")
 ANEW = Action("again", "Assign all anew", "a")
 RESTART = Action("restart", "All again from the start pose", "a")
-SKIP = Action("skip", "Skip", "s")
 ACCEPT = Action("accept", "Accept and track", "y")
 MORE = Action("more", f"{MORE_S:.0f} s more motion", "m")
-EXCHANGE = Action("exchange", "Exchange these sensors", "x")
 MEASURE = Action("measure", "Use this length", "l")  # its entry names the length
 
 
@@ -182,7 +180,7 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
             for ticks in guide.ticks if guide.now >= begin else ():
                 pose = pose or attempt.stream.detect_start_pose(seconds)
                 row = pose.push(ticks.gyro_S, ticks.accel_S)
-                progress, moving = pose.held_s / seconds, [[*attempt.segments.values()][k] for k in pose.moving]
+                progress, moving = pose.held_s / seconds, [attempt.stream.sensors[k] for k in pose.moving]
                 moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
                 moved = moved if pose.state == "moved" else ""
                 if row is not None:
@@ -212,14 +210,14 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
     begin, running = guide.now + GET_READY_S, False
     estimate: Calibration | None = None  # of the motion so far
     future: Future[Calibration] | None = None  # the next one
-    estimated_s, others = 0.0, (FINISH, RESTART, SKIP) if phase in guide.options.optional else (FINISH, RESTART)
+    estimated_s = 0.0
     try:
         while (done_s := attempt.measured_s(phase)) < target_s:
             if guide.monitor.list_silent(guide.segments, guide.now, MOST_LOSS_S):
                 guide.reason = f"{guide.describe_problems()} Headings were lost: begin once more."
                 return "start"
             if not running and guide.now >= begin:
-                attempt.mark("begin", phase=phase, time=attempt.newest)
+                attempt.mark("begin", phase=phase, time=attempt.stream.newest)
                 running = True
             if future is None and done_s >= max(FIRST_ESTIMATE_S, estimated_s + ESTIMATE_PERIOD_S):
                 estimated_s, future = done_s, calculate(partial(guide.options.calibrate, attempt.recording()))
@@ -233,7 +231,7 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
                 None if running else max(0.0, begin - guide.now),
                 max(0.0, target_s - done_s),
                 done_s / target_s,
-                actions=others[done_s <= min(FINISH_AFTER_S, motion.seconds) :],
+                actions=(FINISH, RESTART) if done_s > min(FINISH_AFTER_S, motion.seconds) else (RESTART,),
                 demonstration=phase,
             )
             asked = yield view if estimate is None else _add_estimate(view, estimate, running)
@@ -241,15 +239,10 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
                 return ""
             if asked is RESTART:
                 return "start"
-            if asked is SKIP:
-                attempt.mark("discard", phase=phase)
-                running = False
-                guide.skipped.add(phase)
-                return ""
         return ""
     finally:
         if running:
-            attempt.mark("end", phase=phase, time=attempt.newest)
+            attempt.mark("end", phase=phase, time=attempt.stream.newest)
 
 
 def calculate(compute: Callable[[], Calibration]) -> Future[Calibration]:
@@ -270,8 +263,7 @@ def _add_estimate(view: GuideView, calibration: Calibration, running: bool) -> G
     """The view with what the motion has determined so far, and what to do while the person moves."""
     view = view._replace(lengths=_list_lengths(calibration))
     if calibration.exchanged:
-        note = view.note or "Some sensors seem to sit on other segments than assigned: finish, and see."
-        return view._replace(note=note)
+        return view._replace(note=view.note or "Some sensors seem to sit on other segments than assigned.")
     newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
     if running and np.isfinite(newest).any() and np.nanmedian(newest) > APART:
         view = view._replace(note="They seem to be apart.")
@@ -320,11 +312,6 @@ def show_result(guide: Guide, _: bool) -> StepRun:
                 return max(motions, key=lambda step: step.seconds).phase
             elif asked is RESTART:
                 return "start"
-            elif asked is EXCHANGE and calibration is not None:
-                moved = {label: segment for segment, label in calibration.exchanged.items()}
-                attempt.mark("assign", segments={name: moved.get(own, own) for name, own in attempt.segments.items()})
-                guide.segments = {name: moved.get(own, own) for name, own in guide.segments.items()}
-                return "quality"
             elif asked is not None and asked.name == MEASURE.name:
                 try:
                     guide.measured[length] = 0.01 * float(guide.text.replace(",", "."))
@@ -347,8 +334,8 @@ def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> t
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
     codes, actions = [reason.code for reason in quality.reasons], [ACCEPT, MORE, RESTART]
     if calibration.exchanged:  # all other reasons follow from this one
-        sentence = "Some sensors sit on other segments than assigned. The same motion will do."
-        reasons, actions = reasons[:1], [EXCHANGE, RESTART]
+        sentence = "Some sensors sit on other segments than assigned."
+        reasons, actions = reasons[:1], [RESTART]
     elif quality.quality == "pass":
         sentence = "The calibration is good."
     elif quality.quality == "poor":

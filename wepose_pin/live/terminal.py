@@ -1,4 +1,4 @@
-"""The live view in a terminal: a line for each change, and in a terminal a line of the state now below them."""
+"""The live view in a terminal: a line for each change, a status line below them, and keys."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLEAR = "\r\x1b[K"  # to the begin of the line, and clear it
 
 
 class TerminalView(Output):
-    """Prints a line for each change of a state; a terminal has the state of now in a last line as well.
+    """Prints a line for each change of a state; a terminal has a status line below them.
 
     Times are those since the view was made, by `clock` [s]. `file` None is standard output; without `keyboard` no keys.
     """
@@ -36,7 +36,7 @@ class TerminalView(Output):
     ) -> None:
         self._file, self._keyboard, self._clock, self._begin = file or sys.stdout, keyboard, clock, clock()
         self._actions: tuple[Action, ...] = ()  # that are offered
-        self._reported: dict[str, str] = {}
+        self._reported: dict[str, str] = {}  # what → its state
         self._typing: Action | None = None
         self._typed = ""
 
@@ -74,15 +74,17 @@ class TerminalView(Output):
         if self._keyboard is not None:
             self._keyboard.close()
 
-    def _list_changes(self, status: Status, time_s: str) -> list[str]:
+    def _list_changes(self, status: Status, now: str) -> list[str]:
         """A line for each state that differs from the last one reported; another number in a sentence is no change."""
-        sentence, reasons = _describe_state(status), () if status.guide is None else status.guide.reasons
-        line = "\n    ".join([time_s + sentence, *reasons])
-        states = {"": (re.sub(r"[0-9.]+", "", sentence), line)}  # what → its state, and the line
+        guide, sentence = status.guide, f"{status.state.replace('_', ' ')}: {status.message}"
+        reasons = () if guide is None else guide.reasons
+        if guide is not None:
+            sentence = f"{status.message} {guide.note}".strip()
+        states = {"": (re.sub(r"[0-9.]+", "", sentence), "\n    ".join([now + sentence, *reasons]))}
         for each in status.sensors:
             state = "lost" if each.lost else "there"
-            states[each.segment] = state, f"{time_s}{each.segment}: {state}"
-        states |= {problem: ("now", f"{time_s}{problem}: since now") for problem, n in status.problems.items() if n}
+            states[each.segment] = state, f"{now}{each.segment}: {state}"
+        states |= {problem: ("now", f"{now}{problem}: since now") for problem, n in status.problems.items() if n}
         if self._keyboard is not None and status.state != "ended":
             keys = ", ".join([*(f"{each.key} {each.label}" for each in status.actions), "q end"])
             states["keys"] = keys, f"    keys: {keys}"
@@ -91,25 +93,19 @@ class TerminalView(Output):
         return lines
 
     def _describe_now(self, status: Status) -> str:
-        """The last line: what is typed, else what changes all the time."""
+        """The status line: what is typed, else what changes all the time."""
         if self._typing is not None:
             return f"{self._typing.entry} (Return, or Escape): {self._typed}"
-        guide, parts = status.guide, [_describe_state(status)]
-        if guide is not None:
+        if (guide := status.guide) is not None:
             parts = [] if guide.countdown is None else [f"begins in {math.ceil(guide.countdown)} s"]
             parts += [] if guide.remaining is None else [f"{guide.remaining:.0f} s left"]
-            parts += [f"{100.0 * guide.progress:.0f} %", guide.sentence]
+            return "  ".join([*parts, f"{100.0 * guide.progress:.0f} %", guide.sentence])
+        parts = [f"{status.state.replace('_', ' ')}: {status.message}"]
         if status.state == "ready":
             parts.append("latency {:.1f} ms (p50), {:.1f} ms (p99)".format(*status.latency_ms))
         if status.recorded_s:
             parts.append(f"recording {status.recorded_s:.0f} s")
         return "  ".join(parts)
-
-
-def _describe_state(status: Status) -> str:
-    if status.guide is not None:
-        return f"{status.message} {status.guide.note}".strip()
-    return f"{status.state.replace('_', ' ')}: {status.message}"
 
 
 class Keyboard:

@@ -26,7 +26,6 @@ SILENT_STEP_S = 0.25  # [s] a longer step is a silence
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate of the ticks is measured if the source does not know it
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
-BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
 
 
 def measure_step(time_s: np.ndarray) -> float:
@@ -120,13 +119,13 @@ def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
 class TickStream:
     """Makes ticks once every sensor has sent a sample and the rate is known, and records the arrivals.
 
-    `clock` makes the ticks; before they have begun it has seen nothing.
+    `clock` makes the ticks; before they have begun it has seen nothing. `ticks` holds them until somebody clears it.
     """
 
     def __init__(self, source: Source, log: LiveLog) -> None:
         self.sensors, self.orientations, self.log = tuple(source.sensors), source.orientations, log
         self.clock = StreamSynchronizer(self.sensors, DEFAULT_RATE_HZ, 0.0, orientations=self.orientations)
-        self.has_begun = False
+        self.has_begun, self.ticks = False, list[Ticks]()
         self._rate_hz, self._begin = source.rate_hz, source.begin
         self._waiting: list[Arrivals] = []
 
@@ -151,7 +150,9 @@ class TickStream:
         if self.has_begun:
             waiting, self._waiting = self._waiting, []
             for each in waiting:
-                yield from self.clock.push(each)
+                for ticks in self.clock.push(each):
+                    self.ticks.append(ticks)
+                    yield ticks
                 self.log.flush_if_due()
 
     def _begin_ticks(self) -> None:
@@ -182,24 +183,24 @@ class StartPoseSearch:
             self._instruction = f"{table.name} must stand still in its start configuration"
         elif setup.start_pose == NEUTRAL_POSE:
             self._instruction = "Stand upright and still, arms hanging, palms to the thighs"
-        self._longest_s = 0.0  # [s] for which the person stood still
-        self.ticks: list[Ticks] = []  # since before the start pose
 
     def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
-        """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
-        self.ticks.append(ticks)
+        """Add the stream's newest ticks; return the start pose's first and last tick, and the row in `ticks` after it.
+
+        None: it has not been held yet.
+        """
         if self._stated is not None:
             rate_hz = self._stream.clock.rate_hz
             (row,) = np.nonzero(ticks.time >= self._stated[1] - 0.5 / rate_hz)
             if row.size:
-                begin = round((self._stated[0] - self.ticks[0].time[0]) * rate_hz)
+                begin = round((self._stated[0] - self._stream.clock.begin) * rate_hz)
                 return max(0, begin), ticks.first + int(row[0]), int(row[0]) + 1
             return None
         last = self._pose.push(ticks.gyro_S, ticks.accel_S)
         if last is not None:
             return self._pose.begin, self._pose.end, last + 1
-        if len(self.ticks) > MAX_TICK_BLOCKS:
-            self.ticks = [each for each in self.ticks if each.first + len(each.time) > self._pose.begin]
+        if len(self._stream.ticks) > MAX_TICK_BLOCKS:
+            self._stream.ticks = [each for each in self._stream.ticks if each.first + len(each.time) > self._pose.begin]
         return None
 
     def describe(self, wrong_unit: str, frozen: str) -> tuple[str, str, float]:
@@ -212,13 +213,10 @@ class StartPoseSearch:
         if pose.state == "waiting":
             return "waiting", frozen or f"Waiting for {join_names([sensors[k] for k in pose.missing])}.", 0.0
         progress = min(1.0, pose.held_s / START_POSE_HOLD_S)
-        self._longest_s = max(self._longest_s, pose.held_s)
         if wrong_unit:
             return "moved", wrong_unit, progress
         if pose.state != "moved":
             left_s = max(0.0, START_POSE_HOLD_S - pose.held_s)
             return "start_pose", f"{self._instruction}: {left_s:.0f} s more.", progress
-        if self._longest_s < BEGUN_S:  # the person walks to the place, or takes the pose
-            return "start_pose", f"{self._instruction}.", 0.0
         moved, again = join_names([sensors[k] for k in pose.moving]), self._instruction
         return "moved", f"You moved ({moved}). Once more: {again[0].lower()}{again[1:]}.", progress

@@ -6,7 +6,7 @@ file is in chunks, so that what was written before a session was killed is reada
 docs/live.md lists the topics. Events are ``clock`` when ticks began, ``start`` (``begin``, ``end``: ticks) the start
 pose of tracking, ``reset`` (``tick``) headings anew before that tick; and what was marked, in seconds: ``begin`` and
 ``end`` of a phase (``phase``, ``time``), ``discard`` what was marked of it so far, ``mark`` a text (``text``,
-``time``), ``assign`` (``segments``: sensor → segment) segments that differ from the names in the header.
+``time``).
 """
 
 from __future__ import annotations
@@ -50,11 +50,10 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 
 
 class Markers:
-    """Phases and texts that were marked in a live session, and the segments of its sensors."""
+    """Phases and texts that were marked in a live session."""
 
     def __init__(self) -> None:
         self.texts: list[Mark] = []
-        self.segments: dict[str, str] = {}  # sensor → segment, where it is not the sensor's name
         self._spans: dict[str, list[tuple[float, float]]] = {}
         self._open: dict[str, float] = {}
 
@@ -69,8 +68,6 @@ class Markers:
             self._open.pop(event["phase"], None)
         elif kind == "mark":
             self.texts.append(Mark(event["time"], event["text"]))
-        elif kind == "assign":
-            self.segments = dict(event["segments"])
 
     def phases(self, first: float, last: float) -> dict[str, Intervals]:
         """Name → intervals [s] of each phase, cut to `first` and `last` [s]; one that was not ended ends there."""
@@ -128,7 +125,6 @@ def read_live_log(path: Path) -> LiveRecording:
         markers = Markers()
         for event in events:
             markers.add(event["kind"], event)
-        header["sensors"] = [markers.segments.get(name, name) for name in header["sensors"]]
         ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
         header["phases"] = {**header["phases"], **markers.phases(*ends)}
         if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):

@@ -1,9 +1,8 @@
 """Xsens MTi sensors on serial ports, one port a sensor, by their protocol Xbus.
 
 A frame is ``FA FF MID LEN data checksum``; all bytes but the first add up to zero in the low byte. Numbers are big
-endian. An MTData2 frame (MID 36) is a row of items ``id id length data``. The sensors are configured to send the items
-that a sample needs in one packet, in float32. Source: Xsens, MT Low Level Communication Protocol Documentation
-(MT0101P).
+endian. An MTData2 frame (MID 36) is a row of items ``id id length data``; each must have the items of a sample, in
+float32. Source: Xsens, MT Low Level Communication Protocol Documentation (MT0101P).
 """
 
 from __future__ import annotations
@@ -24,29 +23,20 @@ from ...recording.arrivals import Samples
 from ..state import join_names
 from .base import HostClock, Source, SourceKind, SourceOptions
 
-GO_TO_MEASUREMENT, GO_TO_CONFIG, DATA, ERROR, SET_OUTPUT = 0x10, 0x30, 0x36, 0x42, 0xC0  # messages
-SAMPLE_TIME = 0x1060  # [1e-4 s]
-GYRO, ACCEL = 0x8020, 0x4020  # rate of turn [rad/s] and acceleration [m/s²] in the sensor's axes, up to 100 or 400 Hz
-WITH_EVERY_PACKET = 0xFFFF  # rate of the time
-USUAL_HZ, BAUD = 100, 115200  # a device on USB takes any baud
-ANSWER_S = 0.5  # [s] that a device has for an answer
-TRIES = 3
+DATA = 0x36  # message
+SAMPLE_TIME, GYRO, ACCEL = 0x1060, 0x8020, 0x4020  # items: [1e-4 s], rate of turn [rad/s], acceleration [m/s²]
+GO_TO_MEASUREMENT = b"\xfa\xff\x10\x00\xf1"
+BAUD = 115200  # a device on USB takes any
 SILENT_S = 3.0  # [s] without a byte, after which a port is reopened: not every adapter reports a pulled cable
 RETRY_S = 0.5  # [s] between two attempts to open a port
 WAIT_S = 0.05
 PAUSE_S = 0.002  # [s] between two reads
-
-Frame = tuple[int, bytes]  # MID and data
-
-
-def build_frame(mid: int, data: bytes = b"") -> bytes:
-    body = bytes([0xFF, mid, len(data)]) + data
-    return b"\xfa" + body + bytes([-sum(body) & 0xFF])
+AWAITED = "no packets with SampleTimeFine, RateOfTurn and Acceleration come; configure it with MT Manager"
 
 
-def take_frames(buffer: bytearray) -> tuple[list[Frame], int]:
-    """Take the whole frames out of a buffer; return them, and how many bytes before the last were in none."""
-    frames, at, skipped = list[Frame](), 0, 0
+def take_frames(buffer: bytearray) -> tuple[list[tuple[int, bytes]], int]:
+    """Take the whole frames, MID and data, out of a buffer; return them, and how many bytes before were in none."""
+    frames, at, skipped = list[tuple[int, bytes]](), 0, 0
     while len(buffer) - at >= 5:
         end = at + buffer[at + 3] + 5
         is_frame = buffer[at : at + 2] == b"\xfa\xff"
@@ -62,7 +52,7 @@ def take_frames(buffer: bytearray) -> tuple[list[Frame], int]:
 
 
 def parse_packet(data: bytes) -> tuple[float, tuple[float, ...]] | None:
-    """Device time [s], and gyro [rad/s] and accel [m/s²] of an MTData2 frame; None: not as it was asked for."""
+    """Device time [s], and gyro [rad/s] and accel [m/s²] of an MTData2 frame; None: it lacks one of them."""
     items, at = dict[int, bytes](), 0
     while at + 3 <= len(data):
         end = at + 3 + data[at + 2]
@@ -76,12 +66,9 @@ def parse_packet(data: bytes) -> tuple[float, tuple[float, ...]] | None:
 
 
 def open_spec(rest: str, options: SourceOptions) -> MTiSource:
-    """The source of ``mti:DEVICE=SEGMENT,…[@RATE]``."""
-    pairs, separator, rate = rest.rpartition("@")
-    if separator and not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 400):
-        raise options.error(f"rate '{rate}'; whole samples a second from 1 to 400, as @100")
+    """The source of ``mti:DEVICE=SEGMENT,…``."""
     devices: dict[str, str] = {}
-    for pair in (pairs if separator else rest).split(","):
+    for pair in rest.split(","):
         device, _, segment = pair.rpartition("=")
         if not device:
             raise options.error(f"'{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0={options.segments[0]}")
@@ -89,24 +76,23 @@ def open_spec(rest: str, options: SourceOptions) -> MTiSource:
         if segment in devices or device in devices.values():
             raise options.error(f"'{pair}': each device and each segment is named once")
         devices[segment] = device
-    chosen = {name: devices[name] for name in options.choose(devices, "device for")}
-    return MTiSource(chosen, int(rate) if separator else USUAL_HZ)
+    return MTiSource({name: devices[name] for name in options.choose(devices, "device for")})
 
 
 class MTiSource(Source):
-    """Sensors on `devices` (segment → port), which are configured, lastingly, to send at `rate_hz`.
+    """Sensors on `devices` (segment → port).
 
-    One thread a port opens it, configures the device and listens, again and again, so that arrivals are stamped in time
-    and a lost port is taken up when it is back.
+    One thread a port opens it and listens, again and again, so that arrivals are stamped in time and a lost port is
+    taken up when it is back.
     """
 
-    def __init__(self, devices: Mapping[str, str], rate_hz: int = USUAL_HZ) -> None:
-        super().__init__(devices, rate_hz)
+    def __init__(self, devices: Mapping[str, str]) -> None:
+        super().__init__(devices)
         try:
             import serial
         except ImportError:
             raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
-        self._serial, self._devices, self._hz = serial, dict(devices), rate_hz
+        self._serial, self._devices = serial, dict(devices)
         self._inbox: SimpleQueue[Samples | str] = SimpleQueue()  # samples, or a problem
         self._waits = dict.fromkeys(devices, "the port is being opened")  # segment → why nothing comes; empty: it does
         self._stop = threading.Event()
@@ -154,10 +140,9 @@ class MTiSource(Source):
         while not self._stop.is_set():
             try:
                 with self._serial.Serial(path, BAUD, timeout=WAIT_S, write_timeout=1.0, exclusive=True) as port:
-                    buffer = bytearray()
-                    self._configure(port, buffer)
-                    self._waits[segment] = ""
-                    self._listen(segment, port, buffer)
+                    port.write(GO_TO_MEASUREMENT)  # it may be in its state of configuration
+                    self._waits[segment] = AWAITED
+                    self._listen(segment, port)
             except (OSError, ValueError) as error:  # SerialException is an OSError
                 if not self._waits[segment]:
                     self._inbox.put(f"connections lost to {segment}")
@@ -165,46 +150,24 @@ class MTiSource(Source):
                 self._waits[segment] = f"cannot open the port ({os.strerror(errno)})" if errno else str(error)
                 self._stop.wait(RETRY_S)
 
-    def _configure(self, port: Any, buffer: bytearray) -> None:
-        """Ask for one packet with time, rate of turn and acceleration, in float32."""
-        self._ask(port, buffer, GO_TO_CONFIG)
-        items = struct.pack(">6H", SAMPLE_TIME, WITH_EVERY_PACKET, ACCEL, self._hz, GYRO, self._hz)
-        mid, answer = self._ask(port, buffer, SET_OUTPUT, items)
-        rates = dict(struct.iter_unpack(">2H", answer[: len(answer) // 4 * 4])) if mid != ERROR else {}
-        offer = min(rates.get(GYRO, 0), rates.get(ACCEL, 0))
-        if offer != self._hz:
-            raise OSError(f"it has no {self._hz} Hz" + (f"; it offers {offer} Hz: write @{offer}" if offer else ""))
-        self._ask(port, buffer, GO_TO_MEASUREMENT)
-
-    def _ask(self, port: Any, buffer: bytearray, mid: int, data: bytes = b"") -> Frame:
-        for _ in range(TRIES):
-            port.write(build_frame(mid, data))
-            deadline = time.monotonic() + ANSWER_S
-            while time.monotonic() < deadline and not self._stop.is_set():
-                buffer += port.read(port.in_waiting or 1)
-                for frame in take_frames(buffer)[0]:
-                    if frame[0] in (mid + 1, ERROR):
-                        return frame
-        raise OSError(f"no MTi answers at {BAUD} baud; check the cable, the port and the baud rate")
-
-    def _listen(self, segment: str, port: Any, buffer: bytearray) -> None:
-        clock, last_byte = HostClock(), time.monotonic()
+    def _listen(self, segment: str, port: Any) -> None:
+        buffer, clock, last_byte = bytearray(), HostClock(), time.monotonic()
         while not self._stop.is_set():
             data, now = port.read(port.in_waiting or 1), time.monotonic()
             if data:
                 last_byte = now
             elif now - last_byte > SILENT_S:
-                raise OSError("nothing comes")
+                raise OSError(f"nothing comes at {BAUD} baud; check the cable, the port and the baud rate")
             buffer += data
             frames, skipped = take_frames(buffer)
             packets = [parse_packet(content) for mid, content in frames if mid == DATA]
-            samples = [packet for packet in packets if packet is not None]
-            if skipped or len(samples) < len(frames):
-                self._inbox.put(f"damaged packets and errors of {segment}")
-            if samples:
+            if (skipped or None in packets) and not self._waits[segment]:  # before, it may begin within a packet
+                self._inbox.put(f"damaged or incomplete packets of {segment}")
+            if samples := [packet for packet in packets if packet is not None]:
                 time_s, values = map(np.array, zip(*samples, strict=True))
                 self._inbox.put(Samples(segment, clock.to_host(time_s, now), values[:, :3], values[:, 3:]))
+                self._waits[segment] = ""
             time.sleep(PAUSE_S)
 
 
-KIND = SourceKind("mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]", open_spec)
+KIND = SourceKind("mti:DEVICE=SEGMENT,DEVICE=SEGMENT", open_spec)

@@ -104,7 +104,6 @@ function small(id, value, unit) {
 }
 
 // ---- what the person may ask for: actions that are offered, by buttons and keys
-const PAST = ["done", "skipped"];                                        // steps of the guide that can be repeated
 let actions = [], steps = [], shownActions = "";
 function ask(action, text = "") {
   const through = socket.readyState === WebSocket.OPEN;
@@ -160,8 +159,8 @@ function showGuide(guide) {
   $("note").textContent = guide.note;
   $("steps").replaceChildren(...steps.map(({ name, title, state }) => {
     const item = Object.assign(document.createElement("li"), { className: state });
-    const inner = text(item, PAST.includes(state) ? "button" : "span", title);
-    if (PAST.includes(state)) inner.addEventListener("click", () => ask(name));
+    const inner = text(item, state === "done" ? "button" : "span", title);   // to repeat it
+    if (state === "done") inner.addEventListener("click", () => ask(name));
     if (state === "now") item.setAttribute("aria-current", "step");
     return item;
   }));
