@@ -16,7 +16,7 @@ from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -53,20 +53,7 @@ PositiveOrInfinite = Annotated[float, Range(0.0, closed=False, infinite=True)]
 Count = Annotated[int, Range(0.0, closed=True)]
 
 
-class _Rule(NamedTuple):
-    """What an annotation, or one of a union, takes."""
-
-    kind: Any  # of `isinstance`
-    words: str
-    limits: Range | None = None
-    choices: tuple[Any, ...] = ()
-    parts: tuple[Any, ...] = ()  # annotations of what a list or a mapping holds
-
-    def takes(self, value: Any) -> bool:
-        number = self.kind in (Real, Integral)
-        return isinstance(value, self.kind) and not (number and (isinstance(value, bool) or value != value))
-
-
+# Annotation → class of the values that it takes, and what it takes in words.
 _KINDS: dict[Any, tuple[Any, str]] = {
     float: (Real, "a number"),
     int: (Integral, "a whole number"),
@@ -82,29 +69,46 @@ _KINDS: dict[Any, tuple[Any, str]] = {
 
 
 @cache
-def _find_rules(hint: Any) -> tuple[_Rule, ...]:
-    origin, parts = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):
-        return tuple(rule for part in parts for rule in _find_rules(part))
-    if origin is Annotated:
-        limits = next((note for note in parts[1:] if isinstance(note, Range)), None)
-        if limits is None or get_origin(parts[0]) is not tuple:
-            rules = _find_rules(parts[0])
-            return rules if limits is None else tuple(each._replace(limits=limits, words=str(limits)) for each in rules)
-        origin, parts = tuple, tuple(each if each is ... else Annotated[each, limits] for each in get_args(parts[0]))
+def _split(hint: Any) -> tuple[tuple[Any, Range | None], ...]:
+    """Split an annotation into those of a union, each with its range."""
+    if get_origin(hint) in (Union, UnionType):
+        return tuple(each for part in get_args(hint) for each in _split(part))
+    if get_origin(hint) is Annotated:
+        base, *notes = get_args(hint)
+        limits = next((note for note in notes if isinstance(note, Range)), None)
+        if limits is not None and get_origin(base) is tuple:  # of its numbers
+            items = (each if each is ... else Annotated[each, limits] for each in get_args(base))
+            return _split(tuple.__class_getitem__(tuple(items)))
+        return tuple((part, limits or own) for part, own in _split(base))
+    return ((hint, None),)
+
+
+def _find_kind(hint: Any) -> Any:
+    """Return the class of the values that an annotation takes; `tuple` of every list."""
+    origin = get_origin(hint) or hint
+    return str if origin is Literal else tuple if origin is Sequence else _KINDS.get(origin, (origin,))[0]
+
+
+def _takes(hint: Any, value: Any) -> bool:
+    kind = _find_kind(hint)
+    is_no_number = kind in (Real, Integral) and (isinstance(value, bool) or value != value)
+    return isinstance(value, tuple | list if kind is tuple else kind) and not is_no_number
+
+
+def _describe_part(hint: Any, limits: Range | None) -> str:
+    origin, parts = get_origin(hint) or hint, get_args(hint)
     if origin is Literal:
-        return (_Rule(str, f"one of {', '.join(filter(None, parts))}", choices=parts),)
-    if (origin or hint) in (tuple, Sequence):
-        count = f"{len(parts)} " if origin is tuple and ... not in parts else ""
-        items = re.sub(r"^an? ((whole |finite )?\w+)", r"\1s", describe(parts[0])) if parts else "values"
-        return (_Rule(tuple | list, f"a list of {count}{items}", parts=parts),)
-    kind, words = _KINDS.get(origin or hint) or (origin or hint, f"an object of class {(origin or hint).__name__}")
-    return (_Rule(kind, words, parts=parts),)
+        return f"one of {', '.join(filter(None, parts))}"
+    if origin in (tuple, Sequence):
+        count = f"{len(parts)} " if origin is tuple and parts and ... not in parts else ""
+        item = describe(parts[0]) if parts else "a value"
+        return f"a list of {count}" + re.sub(r"^an? ((whole |finite )?\w+)", r"\1s", item)
+    return str(limits or _KINDS.get(origin, (origin, f"an object of class {origin.__name__}"))[1])
 
 
 def describe(hint: Any) -> str:
     """Return what an annotation takes in words, such as "a number [deg] from 0 to 90"."""
-    return ", or ".join(dict.fromkeys(rule.words for rule in _find_rules(hint)))
+    return ", or ".join(dict.fromkeys(_describe_part(*each) for each in _split(hint)))
 
 
 @cache
@@ -128,23 +132,25 @@ def check_fields(value: Any, place: str, kind: type | None = None) -> None:
 
 def check_value(place: str, value: Any, hint: Any, error: type[Exception] = BadOption) -> None:
     """Check a value and its contents against an annotation; `place` begins the text of the `error` that is raised."""
-    rules = _find_rules(hint)
-    rule = next((rule for rule in rules if rule.takes(value)), None)
-    if rule is None or (rule.limits is not None and value not in rule.limits):
-        raise error(f"{place} = {_show(value)}; {rule.words if rule else describe(hint)} is needed")
-    if rule.choices and value not in rule.choices:
-        raise error(f"{place} = {_show(value)} is not known; {one_of(filter(None, rule.choices), value)}")
-    if isinstance(value, Mapping):
-        for name, entry in value.items() if rule.parts else ():
-            check_value(f"{place}: name", name, rule.parts[0], error)
-            check_value(f"{place}.{name}", entry, rule.parts[1], error)
-    elif rule.parts and isinstance(value, tuple | list):
-        each = [rule.parts[0]] * len(value) if rule.parts[-1] is ... or len(rule.parts) == 1 else rule.parts
+    part, limits = next((each for each in _split(hint) if _takes(each[0], value)), (None, None))
+    parts = get_args(part)
+    if part is None or (limits is not None and value not in limits):
+        needed = describe(hint) if part is None else str(limits)
+        raise error(f"{place} = {_show(value)}; {needed} is needed")
+    if get_origin(part) is Literal:
+        if value not in parts:
+            raise error(f"{place} = {_show(value)} is not known; {one_of(filter(None, parts), value)}")
+    elif isinstance(value, Mapping):
+        for name, entry in value.items() if parts else ():
+            check_value(f"{place}: name", name, parts[0], error)
+            check_value(f"{place}.{name}", entry, parts[1], error)
+    elif parts and isinstance(value, tuple | list):
+        each = [parts[0]] * len(value) if len(parts) == 1 or ... in parts else parts
         if len(value) != len(each):
-            raise error(f"{place} = {_show(value)}; {rule.words} is needed")
-        for k, (entry, part) in enumerate(zip(value, each, strict=True)):
-            check_value(f"{place}[{k}]", entry, part, error)
-    elif rule.kind is not object and (is_dataclass(value) or hasattr(value, "_fields")):
+            raise error(f"{place} = {_show(value)}; {_describe_part(part, None)} is needed")
+        for k, (entry, own) in enumerate(zip(value, each, strict=True)):
+            check_value(f"{place}[{k}]", entry, own, error)
+    elif part is not Any and (is_dataclass(value) or hasattr(value, "_fields")):
         value.check() if hasattr(value, "check") else check_fields(value, f"{place}.")
 
 
@@ -181,11 +187,11 @@ def check_numbers(
             raise BadData(f"{place}: no {what}: length {length.flat[int(np.argmax(off))]:.6g}")
 
 
-def check_names(place: str, names: Collection[str], known: Collection[str], otherwise: str = "") -> None:
-    """Raise `BadOption` where a name is not known; `otherwise` ends the error's text."""
+def check_names(place: str, names: Collection[str], known: Collection[str]) -> None:
+    """Raise `BadOption` where a name is not known."""
     for name in names:
         if name not in known:
-            raise BadOption(f"{place}: '{name}' is not known; {one_of(known, name)}{otherwise}")
+            raise BadOption(f"{place}: '{name}' is not known; {one_of(known, name)}")
 
 
 def format_settings(value: Any) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -168,17 +167,17 @@ def quantity(value: float | None, unit: str) -> str:
     return (text.rstrip("0").rstrip(".") if "." in text else text) + name
 
 
-class _Formatter(string.Formatter):
-    """Fields of a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{text}`` as it is."""
-
-    def format_field(self, value: Any, format_spec: str) -> str:
-        if format_spec == "name":
-            return str(value).replace("_", " ")
-        return quantity(value, format_spec) if format_spec else str(value)
-
-
 def _fill(template: str, known: Mapping[str, Any]) -> str:
-    text = _Formatter().vformat(template, (), known)
+    """Fill in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
+
+    def write(match: re.Match[str]) -> str:
+        if match[1] is None:
+            return match[0][0]  # a doubled brace
+        value, unit = known[match[1]], match[2]
+        text = quantity(value, unit) if unit and unit != "name" else str(value)
+        return text.replace("_", " ") if unit == "name" else text
+
+    text = re.sub(r"\{\{|\}\}|\{(\w+)(?::([^}]+))?\}", write, template)
     # A name at the beginning of a sentence; a file's name stays as it is.
     return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
 

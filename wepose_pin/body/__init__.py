@@ -5,8 +5,8 @@ joints with intersecting orthogonal axes and massless links between them. They a
 `pin.JointModelSpherical`, whose frame at zero is that of the link it moves; a `floating` joint likewise, since W does
 not travel. Other joints stay as they are.
 
-`table` is what stands on a body, and its file; `tree` the joints, and links by the table's names, in our frames;
-`lengths` measures and stretches, and has the way from the root to each point; `body` is what they make (`BodyModel`).
+`table` is what stands on a body, and its file; `tree` the joints and lengths, with links by the table's names in our
+frames; `body` is what they make (`BodyModel`).
 A person's numbers stand in `subject`, those of all people in `anthropometry`; `mounts` finds how sensors are mounted
 from the start pose. `configuration` solves for joints and points from orientations of segments (`KinematicsSolver`),
 which make a `Pose` (`kinematics`); `links` places links and points and says how well they are known.

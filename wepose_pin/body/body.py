@@ -16,12 +16,19 @@ from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadSession, one_of
 from ..libraries import asset
-from . import lengths as _lengths
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
-from .lengths import measure_reaches
 from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, read_table
-from .tree import MOST_LINKS, Tree, build, check_joint_values, parse_tree, rename_links
+from .tree import (
+    MOST_LINKS,
+    build,
+    check_joint_values,
+    measure_lengths,
+    measure_reaches,
+    parse_tree,
+    rename_links,
+    stretch_robot,
+)
 from .urdf import Visual, import_yourdfpy, list_visuals, read_urdf
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
@@ -76,7 +83,7 @@ class BodyModel:
     @cached_property
     def lengths(self) -> dict[str, float]:
         """The lengths [m] that this model has, measured on it in the neutral configuration."""
-        return _lengths.measure_lengths(self.robot, self.table)
+        return measure_lengths(self.robot, self.table)
 
     @property
     def chains(self) -> dict[str, tuple[int, ...]]:
@@ -159,8 +166,8 @@ class BodyModel:
                 raise BadModel(f"{self.robot.name}: the model has no length '{name}'; {one_of(own, name)}")
             if not 0.0 < value < 10.0:
                 raise BadModel(f"{self.robot.name}: length {name} = {value!r}: above 0 and below 10 m is needed")
-        robot = _lengths.with_lengths(self.robot, self.table, lengths)
-        body = _body(robot, self.table, robot.name)
+        robot = stretch_robot(self.robot, self.table, lengths)
+        body = _build_body(robot, self.table, robot.name)
         return replace(body, girdles=self.girdles, personal=self.personal)
 
     def urdf(self) -> str:
@@ -231,20 +238,16 @@ def load_model(path: str | Path | None = None, lengths: Mapping[str, float] | No
     0.26
     """
     check_arguments(load_model, locals())
-    body = _load(path)
+    body = load_sensed_model(path)
     return body.with_lengths(lengths) if lengths else body
 
 
-def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: str) -> BodyModel:
+def load_sensed_model(path: str | Path | None, sensors: Collection[str] = (), where: str = "") -> BodyModel:
     """Read the body of a recording whose sensors have these names; of a URDF without a table a mechanism.
 
     Its segments are the links that bear the sensors, as they are; a sensor whose name is no link raises `BadSession`,
     whose text begins with `where`. Parameters and errors else as of `load_model`.
     """
-    return _load(path, sensors, where)
-
-
-def _load(path: str | Path | None, sensors: Collection[str] = (), where: str = "") -> BodyModel:
     default = asset("urdf", f"{DEFAULT_BODY}.urdf")
     file = default if path is None else Path(path)
     if not (file.suffix or file.exists() or len(file.parts) > 1):  # the name of a body of the package
@@ -257,15 +260,23 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
     own_table = read_table(path) if path.suffix.lower() == ".toml" else None
     urdf = path if own_table is None else path.parent / own_table.urdf
     robot = read_urdf(urdf)
-    tree = parse_tree(robot, str(urdf))
+    tree, default = parse_tree(robot, str(urdf)), load_table()
     if own_table is not None:
         for pose, values in own_table.poses.items():
             check_joint_values(robot, values, f"{own_table.where}: poses.{pose}", BadModel)
     table = own_table or find_table(urdf, tree.below)
-    if table is None and sensors:
-        return _build_mechanism(robot, tree, sensors, str(urdf), where)
+    if table is None and sensors:  # a mechanism of the links with sensors
+        for name in sensors:
+            if name not in tree.below:
+                choices = one_of(tree.below, name, MOST_LINKS)
+                raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
+        links = sorted(sensors, key=lambda name: len(tree.path(name)))
+        segments = {name: Segment.of_mechanism(name, rigid=True) for name in links}
+        body = _build_body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(urdf)), str(urdf))
+        if not body.pin.nv:
+            raise BadModel(f"{urdf}: no joint moves; a chain of revolute or prismatic joints is needed")
+        return body
     if table is None:
-        default = load_table()
         lacking = [name for name in default.needed if default.segments[name].link not in tree.below]
         raise BadModel(
             f"{urdf}: no link {', '.join(map(repr, lacking))}; name the segments' links in a table, as docs/models.md "
@@ -278,7 +289,7 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
         girdles={name: girdle for name, girdle in table.girdles.items() if joints.issuperset(girdle.joints)},
         poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)},
     )
-    body = _body(*rename_links(robot, table), str(urdf))
+    body = _build_body(*rename_links(robot, table), str(urdf))
     for segment in body.table.needed:
         above = body.parents[segment]
         if above is not None and not body.chains[segment]:
@@ -287,26 +298,13 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
         if body.parents[hinge.moves] != hinge.on:
             raise BadModel(f"{table.where}: hinges.{name} is none: {hinge.moves} does not hang on {hinge.on}")
     if own_table is not None:  # an error where the table does not give its lengths
-        _lengths.with_lengths(body.robot, body.table, {name: 1.1 * value for name, value in body.lengths.items()})
+        stretch_robot(body.robot, body.table, {name: 1.1 * value for name, value in body.lengths.items()})
     return body
 
 
 _load_packaged_body = lru_cache(_load_body)  # read once; a `BodyModel` does not change
 
 
-def _build_mechanism(robot: Any, tree: Tree, sensors: Collection[str], urdf: str, where: str) -> BodyModel:
-    for name in sensors:
-        if name not in tree.below:
-            choices = one_of(tree.below, name, MOST_LINKS)
-            raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
-    links = sorted(sensors, key=lambda name: len(tree.path(name)))
-    segments = {name: Segment.of_mechanism(name, rigid=True) for name in links}
-    body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=urdf), urdf)
-    if not body.pin.nv:
-        raise BadModel(f"{urdf}: no joint moves; a chain of revolute or prismatic joints is needed")
-    return body
-
-
-def _body(robot: Any, table: BodyTable, where: str) -> BodyModel:
+def _build_body(robot: Any, table: BodyTable, where: str) -> BodyModel:
     model, joints, axes = build(robot, where, spherical=not table.is_mechanism)
     return BodyModel(model, robot, table, joints, axes)

@@ -13,7 +13,7 @@ from ..errors import BadModel
 from ..rotations import unwrap_signs
 from .body import BodyModel
 from .girdle import MEAN_RAISED, PARAMETERS, follow_law
-from .lengths import UNIVERSE
+from .tree import UNIVERSE
 
 _DETERMINED = 1e-9  # [m/rad or rad/rad] by which open motions may move what is determined: rounding
 _OPEN = 1e-3  # share of an open motion from which a joint counts as undetermined

@@ -159,10 +159,9 @@ def compute_start_heading_var(
     It is zero for the segment whose heading defines x. A calibrated mount contains the heading error of the
     calibration's start pose, so that only the variance between two start poses of one person is left.
     """
-    if segment == start_pose.table.reference:
-        return 0.0
     is_calibrated = find_mount_covariance(recording, segment, subject) is not None
-    return float(start_pose.std(segment, again=is_calibrated)[2] ** 2)
+    is_reference = segment == start_pose.table.reference
+    return 0.0 if is_reference else float(start_pose.std(segment, again=is_calibrated)[2] ** 2)
 
 
 def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
@@ -203,7 +202,8 @@ def align_sensors(
         R_WS_nominal = start_pose.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
         psi = compute_heading_offset(R_VS, R_WS_nominal)
         R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS
-        tilt_error = float((R_WS_start * R_WS_nominal.inv()).magnitude())
+        error = R_WS_start * R_WS_nominal.inv()
+        tilt_error, limit = float(error.magnitude()), float(np.deg2rad(MOUNT_WARNING_DEG))
         if tilt_error > np.deg2rad(MAX_MOUNT_ERROR_DEG):
             name, remedy = ".mount", "state which sensor axis points up and which forward"
             if subject is not None and segment in subject.mounts and not recording.remounted:
@@ -213,14 +213,13 @@ def align_sensors(
                 f"{recording.where()}: sensors.{segment}{name} is {np.degrees(tilt_error):.0f} deg off gravity in the "
                 f"start pose ({format_span(start)}); {remedy}, or the seconds of the start pose in [phases]"
             )
-        if tilt_error > np.deg2rad(MOUNT_WARNING_DEG):
-            limit = float(np.deg2rad(MOUNT_WARNING_DEG))
+        if tilt_error > limit:
             diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit))
         mount_cov = find_mount_covariance(recording, segment, subject, start_pose)
         if mount_cov is not None and subject is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
-            misfit = (R_WS_start * R_WS_nominal.inv()).as_rotvec()[:2]
+            misfit = error.as_rotvec()[:2]
             misfit_cov = mount_cov[:2, :2] + np.diag(start_pose.std(segment)[:2] ** 2)
             R_WS_start = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_WS_nominal
             psi = compute_heading_offset(R_VS, R_WS_start)
@@ -228,9 +227,8 @@ def align_sensors(
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - subject.start_pose_offset[segment][:2]
                 misfit_cov = np.diag(start_pose.std(segment, again=True)[:2] ** 2)
-            stds = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5
+            stds, value = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5, float(np.linalg.norm(misfit))
             if stds > MOUNT_MOVED_STDS:
-                value = float(np.linalg.norm(misfit))
                 limit = value * MOUNT_MOVED_STDS / stds  # [rad] in the direction of the misfit
                 facts: dict[str, float | str] = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
                 diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))

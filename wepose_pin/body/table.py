@@ -6,7 +6,7 @@ Outside simulation and joint angles no module names a segment, a point or a leng
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -205,8 +205,7 @@ class BodyTable:
     def find_limb(self, point: str) -> Limb | None:
         """Return the limb up to a point; None: it is on none, or its first one. A line across the body is no limb."""
         lines = (line for line in self.draw.limbs if point in line[1:] and self.counterpart(line[0]) not in line)
-        line = next(lines, None)
-        if line is None:
+        if not (line := next(lines, ())):
             return None
         points = line[: line.index(point) + 1]
         between = {(*length.start, *length.end): length.segment for length in self.lengths.values()}
@@ -251,21 +250,18 @@ def prune_table(table: BodyTable) -> BodyTable:
         if tissue.relative_to and tissue.relative_to not in segments:
             tissue = tissue._replace(relative_to="", per_tilt=ZERO, per_twist=0.0)
         segments[name] = segment._replace(soft_tissue=tissue)
-
-    def complete(parts: Mapping[str, Any], needs: Callable[[str, Any], Iterable[str]]) -> dict[str, Any]:
-        return {name: part for name, part in parts.items() if known.issuperset(needs(name, part))}
-
+    lengths = {k: v for k, v in table.lengths.items() if known.issuperset((v.segment, *v.start, *v.end))}
+    hinges = {k: v for k, v in table.hinges.items() if known.issuperset((v.on, v.moves))}
     limbs = tuple(limb for limb in table.draw.limbs if known.issuperset(limb))
-    pruned = replace(
+    return replace(
         table,
         segments=segments,
-        lengths=complete(table.lengths, lambda _, length: (length.segment, *length.start, *length.end)),
-        hinges=complete(table.hinges, lambda _, hinge: (hinge.on, hinge.moves)),
-        girdles=complete(table.girdles, lambda point, girdle: (point, girdle.on, girdle.moves)),
+        lengths=lengths,
+        hinges=hinges,
+        girdles={k: v for k, v in table.girdles.items() if known.issuperset((k, v.on, v.moves))},
         draw=Drawing(limbs, tuple(point for point in table.draw.paths if point in known)),
+        pairs={k: v for k, v in table.pairs.items() if (known | {*lengths, *hinges}).issuperset((k, v))},
     )
-    known |= {*pruned.lengths, *pruned.hinges}
-    return replace(pruned, pairs=complete(table.pairs, lambda left, right: (left, right)))
 
 
 MODEL_TABLE = "model.toml"
@@ -348,15 +344,15 @@ def _normalise_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
 
 def _check_table(table: BodyTable, top: TomlTable) -> None:
     """Raise `BadModel` on names that the table does not know, parallel axes, and labels that are no expression."""
+    drawn = (*(point for limb in table.draw.limbs for point in limb), *table.draw.paths)
     names = (*table.segments, *table.points, *table.lengths, *table.hinges)
     for key, used, known in (
-        ("girdles", table.girdles, table.points),
-        ("pairs", table.pairs, names),
-        ("draw", (*(point for limb in table.draw.limbs for point in limb), *table.draw.paths), table.points),
+        ("girdles", tuple(table.girdles), table.points),
+        ("pairs", tuple(table.pairs), names),
+        ("draw", drawn, table.points),
     ):
-        for name in used:
-            if name not in known:
-                raise BadModel(f"{top.at(key)}: '{name}' is not known; {one_of(known, name)}")
+        if (name := next((name for name in used if name not in known), None)) is not None:
+            raise BadModel(f"{top.at(key)}: '{name}' is not known; {one_of(known, name)}")
     if any(len(limb) < 2 for limb in table.draw.limbs):
         raise BadModel(f'{top.at("draw.limbs")}: lists of points are wanted, as [["hip", "knee", "ankle"]]')
     read_axes(top, table.up, table.forward)

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadModel, MissingFile
 
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
-_TRIMESH = "trimesh"
 
 
 def read_urdf(path: Path) -> Any:
@@ -48,30 +47,22 @@ def read_urdf(path: Path) -> Any:
     return robot
 
 
-class _LateTrimesh(ModuleType):
-    """In place of trimesh while yourdfpy is imported: its names are objects, in annotations; later those of trimesh."""
-
-    in_use = False
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(importlib.import_module(_TRIMESH), name) if self.in_use else object
-
-
 def import_yourdfpy() -> Any:
     """Import yourdfpy; trimesh, which takes half a second, is imported once its scenes are used."""
-    spec = importlib.util.find_spec(_TRIMESH)
-    if "yourdfpy" in sys.modules or _TRIMESH in sys.modules or spec is None:
+    spec = importlib.util.find_spec("trimesh")
+    if "yourdfpy" in sys.modules or "trimesh" in sys.modules or spec is None:
         return importlib.import_module("yourdfpy")
-    late = sys.modules[_TRIMESH] = _LateTrimesh(_TRIMESH)
-    late.__path__ = list(spec.submodule_search_locations or ())  # of trimesh.transformations, which needs NumPy alone
+    stub: Any = ModuleType("trimesh")
+    stub.Scene = stub.Trimesh = object  # in annotations
+    stub.__path__ = list(spec.submodule_search_locations or ())  # of trimesh.transformations, which needs NumPy alone
+    sys.modules["trimesh"] = stub
     try:
         return importlib.import_module("yourdfpy")
     finally:
-        for name in [name for name in sys.modules if name.split(".")[0] == _TRIMESH]:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "trimesh"]:
             del sys.modules[name]
-        late.in_use = True
+        del stub.Scene, stub.Trimesh
+        stub.__getattr__ = lambda name: getattr(importlib.import_module("trimesh"), name)
 
 
 def package_folders(urdf: Path) -> list[str]:
@@ -84,10 +75,8 @@ def package_folders(urdf: Path) -> list[str]:
 def find_mesh(name: str, urdf: Path) -> Path | None:
     """The file of a mesh as a URDF names it; None where there is none."""
     path = name.removeprefix("file://").removeprefix("package://")
-    for folder in package_folders(urdf):
-        if (Path(folder) / path).is_file():
-            return (Path(folder) / path).resolve()
-    return None
+    files = (Path(folder) / path for folder in package_folders(urdf))
+    return next((file.resolve() for file in files if file.is_file()), None)
 
 
 def resolve_meshes(urdf: Path) -> str:
@@ -103,11 +92,8 @@ def resolve_meshes(urdf: Path) -> str:
 
 def find_example_data() -> Path | None:
     """The folder with the robots of example-robot-data; None where it is not installed."""
-    for root in map(Path, sys.path):
-        for prefix in (root / "cmeel.prefix", root.parent.parent.parent):
-            if (prefix / EXAMPLE_DATA).is_dir():
-                return prefix / EXAMPLE_DATA
-    return None
+    roots = (prefix for root in map(Path, sys.path) for prefix in (root / "cmeel.prefix", root.parent.parent.parent))
+    return next((root / EXAMPLE_DATA for root in roots if (root / EXAMPLE_DATA).is_dir()), None)
 
 
 MAX_TRIANGLES = 30_000  # of a whole robot
@@ -130,10 +116,10 @@ class Visual(NamedTuple):
 
 def list_visuals(robot: Any) -> list[Visual]:
     """List the visuals of all links that have a geometry."""
-    colours = {m.name: m.color.rgba for m in robot.materials if m.color is not None}
-    visuals = []
+    colours, visuals = {m.name: m.color.rgba for m in robot.materials if m.color is not None}, []
     for name, visual in ((link.name, visual) for link in robot.links for visual in link.visuals):
-        box, cylinder, sphere, mesh = (getattr(visual.geometry, kind) for kind in ("box", "cylinder", "sphere", "mesh"))
+        shape = visual.geometry
+        box, cylinder, sphere, mesh = shape.box, shape.cylinder, shape.sphere, shape.mesh
         if box is not None:
             kind, size = "box", box.size
         elif cylinder is not None:
@@ -145,9 +131,8 @@ def list_visuals(robot: Any) -> list[Visual]:
         else:
             continue
         rgba = (0.7, 0.7, 0.7, 1.0)
-        if visual.material is not None:
-            own = visual.material.color
-            rgba = own.rgba if own is not None else colours.get(visual.material.name, rgba)
+        if (material := visual.material) is not None:
+            rgba = material.color.rgba if material.color is not None else colours.get(material.name, rgba)
         r, g, b, a = (float(v) for v in rgba)
         M = np.eye(4) if visual.origin is None else visual.origin
         quat, sizes = Rotation.from_matrix(M[:3, :3]).as_quat(), tuple(float(v) for v in size)
@@ -158,12 +143,11 @@ def list_visuals(robot: Any) -> list[Visual]:
 
 def reduce_triangles(meshes: list[Mesh]) -> list[Mesh]:
     """Merge vertices that are near each other until all meshes together have at most `MAX_TRIANGLES`."""
-    cell = FINEST_CELL
-    while True:
+    cell, reduced = FINEST_CELL, meshes
+    while cell == FINEST_CELL or sum(len(triangles) for _, triangles in reduced) > MAX_TRIANGLES:
         reduced = [_simplify(*mesh, cell) for mesh in meshes]
-        if sum(len(triangles) for _, triangles in reduced) <= MAX_TRIANGLES:
-            return reduced
         cell *= CELL_GROWTH
+    return reduced
 
 
 def triangulate(geometry: Any) -> Mesh:

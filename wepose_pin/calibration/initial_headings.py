@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body.lengths import UNIVERSE
+from ..body.tree import UNIVERSE
 from .couplings import Coupling
 from .least_squares import Observations
 from .protocols import Axis, Closure, Direction, FreeMotion

@@ -19,10 +19,10 @@ import numpy as np
 
 from ..body import BodyModel
 from ..body.girdle import PARAMETERS, displace
-from ..body.lengths import UNIVERSE
 from ..body.links import find_carrier
 from ..body.mounts import StartPose
 from ..body.table import Vector
+from ..body.tree import UNIVERSE
 from ..errors import BadSession
 from ..rotations import product_terms
 
