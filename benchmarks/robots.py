@@ -29,7 +29,7 @@ from wepose_pin.retargeting import (
     find_self_collisions,
     load_robot,
 )
-from wepose_pin.writers import read_result
+from wepose_pin.writers import load_result, select_pose
 
 from .tables import Column, Section, Table
 
@@ -111,7 +111,7 @@ def measure_live(session: Path, robots: Sequence[str], interval: tuple[float, fl
         result = Path(folder) / "result"
         with contextlib.redirect_stdout(io.StringIO()):
             track(session, out=result, causal=True, view=False, report=False)
-        pose = read_result(result, interval)[0]
+        pose = select_pose(load_result(result), interval, None)
     for name in robots:
         robot = load_robot(find_map(name))
         stream, commands, steps = follow_pose(robot, pose)

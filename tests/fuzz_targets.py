@@ -33,7 +33,7 @@ from wepose_pin.live.sources import open_source
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.reference import read_reference
 from wepose_pin.retargeting.collision import CollisionModel
-from wepose_pin.writers.result import read_result
+from wepose_pin.writers import load_result
 
 ROOT = Path(wp.__file__).parents[1]
 TABLE = good_table().head(12)
@@ -264,7 +264,7 @@ def describe(folder: Path, data: bytes) -> object:
 
 def read_summary(path: Path) -> object:
     describe_file(path.parent)
-    return read_result(path.parent)
+    return load_result(path.parent)
 
 
 def beside_session() -> dict[str, bytes]:

@@ -46,6 +46,7 @@ def a_pose(segments: tuple[str, ...] = SEGMENTS, n: int = 301, rate_hz: float = 
 def write_folder(folder: Path, pose: Pose) -> Path:
     """A result folder, as far as an export reads it."""
     folder.mkdir()
+    wp.population_subject().save(folder / "subject.toml")
     build_pose_table(pose, covariance=True).write_parquet(folder / "pose.parquet")
     (folder / "subject.urdf").write_text(load_model(lengths=LENGTHS).urdf(), encoding="utf-8")
     (folder / "summary.json").write_text('{"recording": "a = made\\u00b2 one"}', encoding="utf-8")
@@ -269,7 +270,7 @@ def test_what_is_computed_anew_is_of_the_person_whose_shoulders_move_as_theirs(t
     pose = compute_pose(body, upright.time, upright.quat_WL)
     folder = write_folder(tmp_path / "r", pose)
     (folder / "subject.urdf").write_text(body.urdf(), encoding="utf-8")
-    person.save(folder / "subject.toml")
+    person.save(folder / "subject.toml", force=True)
     export(folder, tmp_path / "x.parquet", rate_hz=200.0)
     table = pl.read_parquet(tmp_path / "x.parquet")
     for name, points in pose.points.items():

@@ -349,9 +349,8 @@ def errors_of(result: Path, truth: Path) -> object:
     """What `evaluate` gives."""
     import wepose_pin as wp
     from wepose_pin.body.kinematics import parse_pose_table
-    from wepose_pin.writers import read_result
 
-    return wp.evaluate(read_result(result)[0], parse_pose_table(pl.read_parquet(truth), str(truth)))
+    return wp.evaluate(wp.load_result(result).pose, parse_pose_table(pl.read_parquet(truth), str(truth)))
 
 
 def orientation_values(

@@ -68,9 +68,8 @@ def angles(
     from ..documents import whole_folder
     from ..report import angles as report
     from ..report.page import write_pages
-    from ..writers import read_result
+    from ..writers import load_result, select_pose
     from ..writers.provenance import collect_provenance, write_provenance
-    from ..writers.result import read_phases
 
     if main_angle is not None and repetitions is not None:
         raise BadOption(f"--main-angle {main_angle} finds repetitions, and --repetitions {repetitions} marks them")
@@ -81,11 +80,11 @@ def angles(
             movements: list[Movement] = []
             for k, each in enumerate((result, *further), 1):
                 progress("reading", 0.7 * (k - 1) / (1 + len(further)))
-                pose, _, about = read_result(each, interval, phase)
-                name = str(about.get("recording") or each.name)
+                tracked = load_result(each)
+                pose, name = select_pose(tracked, interval, phase), tracked.name
                 name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
                 try:
-                    movement = build.analyze_movement(name, pose, read_phases(about), chosen)
+                    movement = build.analyze_movement(name, pose, tracked.phases, chosen)
                 except WrongOption as error:
                     raise BadOption(f"{each}: {error}" if further else str(error)) from None
                 movements.append(movement)

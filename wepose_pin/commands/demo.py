@@ -36,9 +36,9 @@ def demo(*, out: Out = Path("wepose-demo"), seed: Seed = 1, force: Force = False
     from ..report.calibration import tabulate_lengths
     from ..report.pages import write_track_pages
     from ..simulation import CIRCLING_POINT, simulate, simulate_person
-    from ..writers import write_result, write_session
+    from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
-    from ..writers.result import as_json, write_subject
+    from ..writers.result import as_json, write_about, write_poses, write_subject
 
     with progress_bar() as progress, whole_folder(out, force) as folder:
         progress("simulating a person", 0.0)
@@ -57,7 +57,8 @@ def demo(*, out: Out = Path("wepose-demo"), seed: Seed = 1, force: Force = False
         errors = evaluate(tracked.pose, truth, simulation.phases["circles"][0])
         write_subject(folder / "subject", calibration.subject, tracked.model)
         summary = tracking.summarize(tracked)
-        write_result(folder / "result", tracked, summary)
+        write_poses(folder / "result", [tracked])
+        write_about(folder / "result", tracked, summary)
         progress("making the page", 0.8)
         failures = write_track_pages(folder / "result", summary, report=False)
         figures = {"seed": seed, "true_lengths": person.lengths, "errors": asdict(errors)}

@@ -64,15 +64,15 @@ def evaluate(
     from ..readers import load_session
     from ..readers.reference import is_reference, read_reference
     from ..recording import select_interval
-    from ..writers import read_result
-    from ..writers.result import read_phases
+    from ..writers import load_result
 
     if not align and fit is not None:
         raise WrongOption("fit", fit, "nothing is fitted with --no-align; leave out one of the two")
     with progress_bar() as progress:
         progress("comparing", 0.0)
-        pose, model, summary = read_result(result)
-        selected = select_interval(pose.time, read_phases(summary), interval, phase)
+        tracked = load_result(result)
+        pose, table = tracked.pose, tracked.model.table
+        selected = select_interval(pose.time, tracked.phases, interval, phase)
         file = load_session(truth, gaps=True).truth if truth.suffix == ".toml" or truth.is_dir() else truth
         if file is None:
             raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
@@ -94,11 +94,11 @@ def evaluate(
             if not scored[0] < scored[1]:
                 needed = f"seconds after {first:.1f}, as those before align the reference; or --no-align"
                 raise WrongOption("interval", f"{begin:g} {end:g}", needed)
-            errors = compare(pose, reference, scored, model.table)
+            errors = compare(pose, reference, scored, table)
             errors = replace(errors, registration=replace(registration, scored=scored))
         else:
             reference = replace(reference, time=reference.time + (time_offset or 0.0))
-            errors = compare(pose, reference, selected, model.table)
+            errors = compare(pose, reference, selected, table)
     print_diagnostics(diagnostics)
     _print_errors(errors)
     return errors

@@ -78,17 +78,18 @@ def retarget(
     from ..report.page import write_pages
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
-    from ..writers import read_result
+    from ..writers import load_result, select_pose
     from ..writers.motion import REPETITIONS
     from ..writers.provenance import collect_provenance
-    from ..writers.result import as_json, read_phases
+    from ..writers.result import as_json
 
     names = ("robot", "arm", "task", "rate_hz", "scale", "smoothing_hz", "speed_scale", "limit_margin")
     chosen: dict[str, Any] = {name: options[name] for name in names}
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
             progress("reading", 0.0)
-            pose, body, about = read_result(result, interval, phase)
+            tracked = load_result(result)
+            pose, body, name = select_pose(tracked, interval, phase), tracked.model, tracked.name
             trajectory = retargeting.retarget(
                 pose,
                 table=body.table,
@@ -100,7 +101,6 @@ def retarget(
             collisions = retargeting.find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
             progress("writing", 0.98)
             retargeting.write_trajectory(folder, trajectory)
-            name = str(about.get("recording") or result.name)
             sides = tuple(arm.side for arm in trajectory.robot.arms)
             angles = joint_angles(pose)
             own = {joint: each for joint, each in angles.joints.items() if joint.startswith(sides)}
@@ -108,7 +108,7 @@ def retarget(
             summary = as_json(retargeting.summarize(trajectory, check, collisions))
             summary |= {
                 "recording": name,
-                "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
+                "recorded_phases": {name: list(map(list, spans)) for name, spans in tracked.phases.items()},
                 REPETITIONS: {
                     "source": repetitions.source,
                     "spans": repetitions.spans.tolist(),

@@ -38,8 +38,7 @@ def view(
 
     from ..documents import check_file, whole_file
     from ..report.viewer import pose_html
-    from ..writers import read_result
-    from ..writers.result import read_phases
+    from ..writers import load_result, select_pose
 
     if out is None and (interval is not None or phase is not None):
         option = f"phase {phase}" if interval is None else "interval {:g} {:g}".format(*interval)
@@ -51,8 +50,9 @@ def view(
         check_file(page, force)
         with progress_bar() as progress:
             progress("making the page", 0.0)
-            pose, model, summary = read_result(result, interval, phase)
-            text = pose_html(model, pose, phases=read_phases(summary), title=summary.get("recording", result.name))
+            tracked = load_result(result)
+            pose = select_pose(tracked, interval, phase)
+            text = pose_html(tracked.model, pose, phases=tracked.phases, title=tracked.name)
             with whole_file(page, force) as partial:
                 partial.write_text(text, encoding="utf-8")
     say(f"Motion:  {page}")

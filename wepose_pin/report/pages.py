@@ -15,8 +15,8 @@ from markupsafe import escape
 from ..diagnostics import Diagnostic
 from ..documents import whole_file
 from ..tracking import TrackResult, TrackSummary, summarize
-from ..writers import write_result
 from ..writers.provenance import CALL, collect_provenance, result_folder
+from ..writers.result import write_about, write_poses
 from .page import write_pages
 from .viewer import pose_html
 
@@ -55,7 +55,8 @@ def save_result(result: TrackResult, folder: str | Path, force: bool = False) ->
         summary = summarize(result)
         # Inputs and options of `track`, under the names that they have in `wepose track`.
         inputs = {"session": result.recording.source, "subject": result.subject.name, "model": result.model.table.name}
-        write_result(partial, result, summary, provenance=collect_provenance(CALL, inputs | dict(result.options)))
+        write_poses(partial, [result])
+        write_about(partial, result, summary, provenance=collect_provenance(CALL, inputs | dict(result.options)))
     write_track_pages(out, summary)
     return out
 

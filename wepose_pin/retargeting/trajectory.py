@@ -25,6 +25,7 @@ from ..body.urdf import read_urdf, resolve_meshes
 from ..errors import BadOption, WrongOption
 from ..recording import select_interval
 from ..tracking import TrackResult
+from ..writers import load_result
 from ..writers.motion import JointMotion
 from .collision import CollisionModel
 from .controller import ControllerParams, JointState, QpController, StepReport
@@ -213,11 +214,7 @@ def _select_pose(
     pose: Pose | TrackResult | str | Path, interval: tuple[float, float] | None, phase: str | None
 ) -> tuple[Pose, BodyTable | None]:
     """Return an interval or a phase of a motion, and the table of its body where it has one."""
-    if isinstance(pose, str | Path):
-        from ..writers import read_result
-
-        cut, body, _ = read_result(Path(pose), interval, phase)
-        return cut, body.table
+    pose = load_result(pose) if isinstance(pose, str | Path) else pose
     phases, table = (pose.phases, pose.model.table) if isinstance(pose, TrackResult) else ({}, None)
     pose = pose.pose if isinstance(pose, TrackResult) else pose
     selected = select_interval(pose.time, phases, interval, phase)

@@ -61,6 +61,11 @@ class TrackResult:
         return float(f"{1.0 / np.median(np.diff(self.time)):.6g}") if len(self.time) > 1 else float("nan")
 
     @property
+    def where(self) -> str:
+        """Its folder or name, for the beginning of an error's text."""
+        return str(self.source) if isinstance(self.source, Path) else self.name
+
+    @property
     def quat_WL(self) -> Mapping[str, np.ndarray]:
         """Segment → (n, 4) xyzw."""
         return Named("segment", self.pose.quat_WL)

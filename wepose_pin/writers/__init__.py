@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .result import read_result, write_result
+from .result import load_result, select_pose
 from .session import write_session
 
-__all__ = ["read_result", "write_result", "write_session"]
+__all__ = ["load_result", "select_pose", "write_session"]

@@ -9,7 +9,7 @@ joint turns by its channels in their order, each about an axis as turned so far.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,11 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..body.configuration import solve_configuration
-from ..body.links import compute_link_poses, find_known_points, move_girdle
+from ..body.links import compute_link_poses, find_known_points
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..rotations import conjugate, multiply
-from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
+from ..tracking import TrackResult
+from .motion import check_complete, diagnose_gaps, resample_evenly
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 # Segment → joint, as other programs name them; those of other bodies have the segment's name in capitals.
@@ -44,15 +45,21 @@ class Bone(NamedTuple):
     end: np.ndarray  # (3,) [m] in W, in the N-pose: where it ends, if it has no children
 
 
-def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
+def write_bvh(path: Path, motion: TrackResult) -> list[Diagnostic]:
     """Write hierarchy and motion; angles are followed over time, so they may go beyond 180°."""
     check_complete(motion, "a .bvh")
     table = motion.model.table
     if table.is_mechanism or table.reference not in motion.pose.quat_WL:
         raise BadData(f"{motion.where}: no orientation of a person's {table.reference}; a .bvh ties all to it")
     motion = resample_evenly(motion)
-    root = _build_skeleton(motion)
-    columns = [100.0 * _to_file_axes(_compute_root_position(motion, root)), *_compute_angles(motion, root, None)]
+    # The points at which limbs hang on the reference segment, as the shoulders.
+    anchors = next((limb.origin for limb in table.drawn_limbs.values() if limb.base == table.reference), ())
+    root = _build_skeleton(motion, anchors)
+    p_W = np.zeros((len(motion.time), 3))  # of the hips
+    if anchors and set(anchors) <= set(motion.points) and not table.girdles:  # a spine without sensors may bend
+        p_W = np.mean([motion.points[point] for point in anchors], axis=0)
+        p_W = p_W - Rotation.from_quat(motion.quat_WL[table.reference]).apply(root.end)
+    columns = [100.0 * _to_file_axes(p_W), *_compute_angles(motion, root, None)]
     lines = ["HIERARCHY", *_format_hierarchy(root, root.at, 0), "MOTION"]
     lines += [f"Frames: {len(columns[0])}", f"Frame Time: {1.0 / motion.rate_hz:.8f}"]
     with path.open("w", encoding="utf-8", newline="\n") as file:
@@ -61,7 +68,7 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     return diagnose_gaps(motion)
 
 
-def _build_skeleton(motion: Motion) -> Bone:
+def _build_skeleton(motion: TrackResult, anchors: Sequence[str]) -> Bone:
     """Build the bones that are known: hips, spine, and of each limb as much as has sensors."""
     model, table, measured = motion.model, motion.model.table, motion.pose.quat_WL
     q = solve_configuration(model, {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in measured})
@@ -70,7 +77,6 @@ def _build_skeleton(motion: Motion) -> Bone:
     p_W = compute_link_poses(model, q, links, rotations=False)[1][0]
     starts, points = dict(zip(table.segments, p_W, strict=False)), dict(zip(known, p_W[count:], strict=True))
     hips = next((segment for segment in table.segments if NAMES.get(segment) == ROOT), None)
-    anchors = _find_anchors(motion)
 
     def find_end(segment: str, at: np.ndarray, above_at: np.ndarray) -> np.ndarray:
         """Find where the bone of a segment ends (3,) [m]."""
@@ -100,36 +106,12 @@ def _build_skeleton(motion: Motion) -> Bone:
     return Bone(ROOT, hips if hips is not None and hips in measured else table.reference, zero, bones, bones[0].end)
 
 
-def _find_anchors(motion: Motion) -> tuple[str, ...]:
-    """Find the points at which limbs hang on the reference segment, as the shoulders; none: no limb does."""
-    table = motion.model.table
-    return next((limb.origin for limb in table.drawn_limbs.values() if limb.base == table.reference), ())
-
-
 def _to_file_axes(v_W: np.ndarray) -> np.ndarray:
     """Return vectors (…, 3) of W in the file's axes: x left, y up, z forward."""
     return v_W[..., [1, 2, 0]]
 
 
-def _compute_root_position(motion: Motion, root: Bone) -> np.ndarray:
-    """Compute where the hips are (n, 3) [m], so that the shoulders, without their own motion, are where they were."""
-    pose, model, anchors = motion.pose, motion.model, _find_anchors(motion)
-    if not anchors or not set(anchors) <= set(pose.points):
-        return np.zeros((len(pose.time), 3))
-    R_WL = {segment: Rotation.from_quat(quat).as_matrix() for segment, quat in pose.quat_WL.items()}
-    at_rest = []
-    for point in anchors:
-        moved = np.zeros((len(pose.time), 3))
-        for name in model.point_girdles[point]:
-            on = model.table.girdles[name].on
-            if on in R_WL:
-                displacement = move_girdle(model, name, pose.quat_WL)[0] - model.girdle_parameters(name)[1:4]
-                moved += np.einsum("nij,nj->ni", R_WL[on], displacement)
-        at_rest.append(pose.points[point] - moved)
-    return np.asarray(np.mean(at_rest, axis=0) - np.einsum("nij,j->ni", R_WL[model.table.reference], root.end))
-
-
-def _compute_angles(motion: Motion, bone: Bone, above: np.ndarray | None) -> Iterator[np.ndarray]:
+def _compute_angles(motion: TrackResult, bone: Bone, above: np.ndarray | None) -> Iterator[np.ndarray]:
     """Compute the angles (n, 3) [deg] about z, x, y of each bone, in the order of the hierarchy."""
     quat_WL = motion.pose.quat_WL[bone.segment]
     quat = quat_WL if above is None else multiply(conjugate(above), quat_WL)

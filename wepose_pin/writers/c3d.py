@@ -17,13 +17,14 @@ from ..body.configuration import solve_configuration
 from ..body.links import compute_link_poses, find_known_links
 from ..errors import BadData
 from ..libraries import import_library
-from .motion import Motion, find_measured_points, resample_evenly
+from ..tracking import TrackResult
+from .motion import find_measured_points, resample_evenly
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
 
 
-def write_c3d(path: Path, motion: Motion) -> None:
+def write_c3d(path: Path, motion: TrackResult) -> None:
     """Write points in W (z up, x forward) and segments to W, single precision; NaN in a gap, with a residual of −1."""
     ezc3d = import_library("ezc3d", "--format c3d", "a C3D")
     motion = resample_evenly(motion)
@@ -60,7 +61,7 @@ def write_c3d(path: Path, motion: Motion) -> None:
         named.unlink(missing_ok=True)
 
 
-def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
+def _compute_transforms(motion: TrackResult) -> dict[str, np.ndarray]:
     """Segment → (n, 4, 4) from its frame, at its upper joint, to W [mm]; at the origin where no place is ever known.
 
     NaN where the segment or, if its place is known, one from which it hangs has no orientation or was bridged.

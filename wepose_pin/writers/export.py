@@ -6,6 +6,7 @@ import contextlib
 import functools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -13,12 +14,11 @@ import polars as pl
 
 from ..angles import angle_table, diagnose_lock, joint_angles
 from ..arguments import check_arguments
-from ..body.kinematics import build_pose_table, find_samples
+from ..body.kinematics import build_pose_table
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file
 from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file, find_plugins, load_plugin
-from ..recording import select_interval
 from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
@@ -27,7 +27,6 @@ from .motion import (
     ROBOT_URDF,
     TRAJECTORY,
     HasJointMotion,
-    Motion,
     check_rate,
     convert_person,
     read_joint_motion,
@@ -36,7 +35,7 @@ from .motion import (
 )
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import data_folder, write_provenance
-from .result import SUBJECT_URDF, format_urdf, read_result, write_table
+from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
 
@@ -70,7 +69,7 @@ def write_urdf(file: Path, result: Result) -> None:
         shutil.copyfile(urdf, file)
 
 
-def write_motion_table(path: Path, motion: Motion) -> list[Diagnostic]:
+def write_motion_table(path: Path, motion: TrackResult) -> list[Diagnostic]:
     """Write the table of the pose, and beside it that of the angles where a joint has both of its segments.
 
     Every number has all its bits. What is not known is empty in a CSV, NaN in Parquet.
@@ -236,7 +235,7 @@ def _is_of_robot(result: Result) -> bool:
 def _read_motion(
     result: Result, format: str, interval: tuple[float, float] | None, phase: str | None, rate_hz: float | None
 ) -> Any:
-    """Read the selected part of a motion, resampled: a `Motion` for formats of a person, or `JointMotion`."""
+    """Read the selected part of a motion, resampled: a `TrackResult` for formats of a person, or `JointMotion`."""
     of = list_formats()[format].of
     if _is_of_robot(result):
         if of == PERSON:
@@ -247,16 +246,10 @@ def _read_motion(
         return robot if rate_hz is None else resample_joints(robot, rate_hz)
     if of == ROBOTS:
         raise BadOption(f"--format {format}: is of robots, as `wepose retarget` writes them; {result} is none")
-    if isinstance(result, TrackResult):
-        selected = select_interval(result.time, result.phases, interval, phase)
-        pose = result.pose if selected is None else result.pose.cut(find_samples(result.time, selected))
-        motion = Motion(pose, result.model, result.name, result.name)
-    else:
-        folder = Path(str(result))
-        pose, model, summary = read_result(folder, interval, phase)
-        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
-    if len(motion.pose.time) < 2:
-        raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
+    motion = result if isinstance(result, TrackResult) else load_result(Path(str(result)))
+    motion = replace(motion, pose=select_pose(motion, interval, phase))
+    if len(motion.time) < 2:
+        raise BadData(f"{motion.where}: a pose of {len(motion.time)} samples; a motion has at least 2")
     motion = motion if rate_hz is None else resample(motion, rate_hz)
     return motion if of == PERSON else convert_person(motion)
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..angles import NEAR_LOCK, euler
 from ..body import BodyModel
 from ..body.configuration import compute_pose, solve_configuration
-from ..body.kinematics import Pose, find_usual_rate
+from ..body.kinematics import find_usual_rate
 from ..body.links import compute_joint_values
 from ..body.tree import joint_axis, joint_placement, parse_tree
 from ..body.urdf import read_urdf
@@ -26,6 +26,7 @@ from ..errors import BadData, MissingFile, WrongOption
 from ..libraries import library_errors
 from ..recording import Intervals, select_interval
 from ..rotations import multiply
+from ..tracking import TrackResult
 from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
@@ -34,21 +35,6 @@ REPETITIONS = "repetitions"  # in the summary of a trajectory, and as the name o
 EVEN = 0.1
 SLACK_S = 1e-6  # [s] by which times that are written with digits differ
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A result, read back."""
-
-    pose: Pose
-    model: BodyModel
-    name: str  # of the recording
-    where: str  # the result's folder, for error texts
-
-    @property
-    def rate_hz(self) -> float:
-        """The rate of its usual time step."""
-        return find_usual_rate(self.pose.time)
 
 
 def make_times(time: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -68,12 +54,12 @@ def check_rate(rate_hz: float) -> None:
         raise WrongOption("rate-hz", f"{rate_hz:g}", "between 1 and 10000 samples a second")
 
 
-def resample_evenly(motion: Motion) -> Motion:
+def resample_evenly(motion: TrackResult) -> TrackResult:
     """Return the motion on even times."""
     return motion if is_even(motion.pose.time) else resample(motion, motion.rate_hz)
 
 
-def resample(motion: Motion, rate_hz: float) -> Motion:
+def resample(motion: TrackResult, rate_hz: float) -> TrackResult:
     """Return the motion at another rate: orientations by the shortest way between two samples, points from the body.
 
     No filter comes before: what is faster than half the new rate is folded. `BadData` is raised where an orientation
@@ -102,7 +88,7 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
     return replace(motion, pose=new)
 
 
-def check_complete(motion: Motion, format_name: str) -> None:
+def check_complete(motion: TrackResult, format_name: str) -> None:
     """Raise `BadData` where a sample of a segment has no orientation, which the format cannot leave out."""
     for segment, quat in motion.pose.quat_WL.items():
         lost = ~np.isfinite(quat).all(axis=1)
@@ -111,7 +97,7 @@ def check_complete(motion: Motion, format_name: str) -> None:
             raise BadData(f"{place}; {format_name} needs one in every row, csv and parquet do not")
 
 
-def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
+def diagnose_gaps(motion: TrackResult) -> list[Diagnostic]:
     """List the segments with gaps, where a format has no way to mark them."""
     return [
         Diagnostic("samples-lost", WARNING, segment, int(np.count_nonzero(gap)), facts={"variant": "unmarked"})
@@ -120,7 +106,7 @@ def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
     ]
 
 
-def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
+def find_measured_points(motion: TrackResult) -> dict[str, np.ndarray]:
     """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged; `BadData`: none is known."""
     pose = motion.pose
     if not pose.points:
@@ -329,7 +315,7 @@ def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
 # Of a person ---------------------------------------------------------------------------------------------------------
 
 
-def convert_person(motion: Motion) -> JointMotion:
+def convert_person(motion: TrackResult) -> JointMotion:
     """Return a person's motion by the joints of the subject's URDF: a spherical joint is three of one axis."""
     check_complete(motion, "a file of joints")
     motion = resample_evenly(motion)

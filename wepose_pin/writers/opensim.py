@@ -29,7 +29,8 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
 from ..rotations import conjugate, multiply, rotation_about
-from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
+from ..tracking import TrackResult
+from .motion import check_complete, diagnose_gaps, find_measured_points, resample_evenly
 
 SETUPS = Path(__file__).parent / "opensim_setups"
 GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
@@ -53,7 +54,7 @@ _ROUNDS, _DAMPING = 40, 1e-9  # of Gauss-Newton; about ten are the rule
 _CLOSE = 1e-9  # [rad] of the last step
 
 
-def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
+def write_mot(path: Path, motion: TrackResult, names: str | None = None) -> list[Diagnostic]:
     """Write joint angles in degrees: the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
     ``<joint>_near_lock`` is 1 where the first and the third angle of a joint are not to be read. A mechanism has the
@@ -93,20 +94,20 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
 # Orientations -----------------------------------------------------------------------------------------------------
 
 
-def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
+def write_sto(path: Path, motion: TrackResult) -> list[Diagnostic]:
     """Write orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``."""
     check_complete(motion, "a .sto")
     _write_quaternions(path, motion, motion.pose.time, orientations(motion.pose.quat_WL))
     return diagnose_gaps(motion)
 
 
-def write_placement(path: Path, motion: Motion) -> None:
+def write_placement(path: Path, motion: TrackResult) -> None:
     """Write one sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
     upright = np.array([[0.0, 0.0, 0.0, 1.0]])
     _write_quaternions(path, motion, np.zeros(1), dict.fromkeys(orientations(motion.pose.quat_WL), upright))
 
 
-def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Mapping[str, np.ndarray]) -> None:
+def _write_quaternions(path: Path, motion: TrackResult, time: np.ndarray, quat_GB: Mapping[str, np.ndarray]) -> None:
     if not quat_GB:
         raise BadData(f"{motion.where}: no segment in pose.parquet is a body of the model; there is none to write")
     cells = {
@@ -122,7 +123,7 @@ def list_setups(sto: Path) -> list[Path]:
     return [sto.with_name(f"{sto.stem}{ending}") for ending in ("_placement.sto", "_placer.xml", "_ik.xml")]
 
 
-def write_setups(sto: Path, written: Sequence[Path], motion: Motion, model: str) -> None:
+def write_setups(sto: Path, written: Sequence[Path], motion: TrackResult, model: str) -> None:
     """Write what OpenSense needs beside a .sto to `written`, in the order of `list_setups`; `model`: the subject's."""
     write_placement(written[0], motion)
     written[1].write_bytes(_fill("placer", model=model, stem=sto.stem))
@@ -140,7 +141,7 @@ def _fill(setup: str, *, scales: str = "", **values: str) -> bytes:
 # The model --------------------------------------------------------------------------------------------------------
 
 
-def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MODEL) -> None:
+def write_scale(path: Path, motion: TrackResult, osim_model: str | Path = GENERIC_MODEL) -> None:
     """Write the set-up of OpenSim's Scale Tool that gives a generic model the subject's lengths; masses stay.
 
     The factors are over the lengths of Rajagopal's model.
@@ -164,7 +165,7 @@ def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MOD
 # Points -----------------------------------------------------------------------------------------------------------
 
 
-def write_trc(path: Path, motion: Motion) -> None:
+def write_trc(path: Path, motion: TrackResult) -> None:
     """Write points in G, in mm; a point in a gap has empty cells."""
     motion = resample_evenly(motion)
     points = find_measured_points(motion)

@@ -51,10 +51,10 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
     for name, value in list(options.items()):
         several = value if isinstance(value, tuple) else (value,)
         # A text may name a file, as that of --protocol.
-        paths = [each for each in several if isinstance(each, Path) or str(each).endswith((".toml", ".urdf"))]
-        if paths and len(paths) == len(several) and all(Path(path).exists() for path in paths):
-            names = [name] if value is several[0] else [f"{name}.{i}" for i in range(len(paths))]
-            inputs |= {each: Path(path) for each, path in zip(names, paths, strict=True)}
+        named = (isinstance(each, Path) or str(each).endswith((".toml", ".urdf")) for each in several)
+        if several and all(named) and all(Path(each).exists() for each in several):
+            names = [name] if value is several[0] else [f"{name}.{i}" for i in range(len(several))]
+            inputs |= {each: Path(path) for each, path in zip(names, several, strict=True)}
             del options[name]
     return {
         "format": FORMAT,

@@ -40,12 +40,6 @@ SUBJECT_URDF = "subject.urdf"
 ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
 
 
-def write_result(folder: Path, tracked: TrackResult, summary: TrackSummary, **others: Any) -> None:
-    """Write a recording that was tracked as a whole into an existing folder; `others` as of `write_about`."""
-    write_poses(folder, [tracked])
-    write_about(folder, tracked, summary, **others)
-
-
 def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = False) -> None:
     """Write ``pose.parquet``, and of a mechanism ``joints.parquet``, of consecutive chunks, one in memory at a time.
 
@@ -123,31 +117,6 @@ def format_urdf(subject: Subject, model: BodyModel) -> str:
     return f"{head}\n<!-- {comment} -->\n{body}"
 
 
-def read_result(
-    folder: Path, interval: tuple[float, float] | None = None, phase: str | None = None
-) -> tuple[Pose, BodyModel, dict[str, Any]]:
-    """Pose, body and summary of a result folder; the body with the subject's lengths and girdles.
-
-    `interval`, `phase`: of the pose, only this interval [s] or this phase of the recording. `WeposeError` is raised
-    where it is no result folder, a file is damaged, or the interval or phase is not in the recording.
-    """
-    if not (folder / "pose.parquet").is_file():
-        raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
-    pose = parse_pose_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
-    if (folder / JOINTS).is_file():
-        table, place = read_table(folder / JOINTS), str(folder / JOINTS)
-        joints = {name: read_columns(table, [name], place, place)[:, 0] for name in table.columns if name != "time"}
-        pose = replace(pose, joints=joints)
-    file, summary = folder / "summary.json", dict[str, Any]()
-    with library_errors(file, "the summary of a result"):
-        summary |= json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    model, subject_file = load_model(folder / SUBJECT_URDF), folder / "subject.toml"
-    if model.table.girdles and subject_file.is_file():
-        model = replace(model, girdles=load_subject(subject_file).girdles)
-    selected = select_interval(pose.time, read_phases(summary), interval, phase)
-    return pose if selected is None else pose.cut(find_samples(pose.time, selected)), model, summary
-
-
 def load_result(folder: str | Path) -> TrackResult:
     """Read a result folder, as `wepose track` and `TrackResult.save` write it.
 
@@ -174,14 +143,31 @@ def load_result(folder: str | Path) -> TrackResult:
     """
     check_arguments(load_result, locals())
     folder = Path(folder)
-    pose, model, summary = read_result(folder)
-    with library_errors(folder / "summary.json", "the summary of a result"):
+    if not (folder / POSE).is_file():
+        raise MissingFile(f"{folder}: no {POSE} in it; a folder that `wepose track` wrote is wanted here")
+    pose = parse_pose_table(read_table(folder / POSE), str(folder / POSE))
+    if (folder / JOINTS).is_file():
+        table, place = read_table(folder / JOINTS), str(folder / JOINTS)
+        joints = {name: read_columns(table, [name], place, place)[:, 0] for name in table.columns if name != "time"}
+        pose = replace(pose, joints=joints)
+    file, summary = folder / "summary.json", dict[str, Any]()
+    with library_errors(file, "the summary of a result"):
+        summary |= json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
         diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
         marks = tuple(Mark(float(time), str(text)) for time, text in summary.get("recorded_marks", ()))
+    model, subject = load_model(folder / SUBJECT_URDF), load_subject(folder)
+    if model.table.girdles:
+        model = replace(model, girdles=subject.girdles)
     name, phases = str(summary.get("recording") or folder.name), read_phases(summary)
     return TrackResult(
-        name, pose, model, load_subject(folder), phases, marks, source=folder, summary=summary, diagnostics=diagnostics
+        name, pose, model, subject, phases, marks, source=folder, summary=summary, diagnostics=diagnostics
     )
+
+
+def select_pose(result: TrackResult, interval: tuple[float, float] | None, phase: str | None) -> Pose:
+    """Select an interval [s] or a phase of a motion; `WeposeError`: it is not in the recording."""
+    selected = select_interval(result.time, result.phases, interval, phase)
+    return result.pose if selected is None else result.pose.cut(find_samples(result.time, selected))
 
 
 def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
