@@ -68,22 +68,26 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         [path] = problem.layout.paths[closure]
         for segment, (B, _) in path.vectors.items():
             A[span] += Rotation.from_quat(quat_WL[segment][span]).as_matrix() @ B
+    rows, advice = (
+        A.reshape(-1, len(names)),
+        "check that the hands do in the phase what the protocol says, and every mount",
+    )
     E, d, d_cov = _state_constraints(problem)
-    # ℓ = E⁺ d + Z z, where Z spans what E leaves free
-    rows, Z, pinv = A.reshape(-1, len(names)), null_space(E), np.linalg.pinv(E)
-    z, _, rank, _ = np.linalg.lstsq(rows @ Z, -rows @ (pinv @ d), rcond=LEAST_EFFECT)
-    lengths, advice = pinv @ d + Z @ z, "check that the hands do in the phase what the protocol says, and every mount"
-    if rank < Z.shape[1]:
+    Z = null_space(E)
+    if np.linalg.matrix_rank(rows @ Z, rtol=LEAST_EFFECT) < Z.shape[1]:
         raise NoSolution(f"{recording.where()}: the motion does not determine the lengths; {advice}")
+    # AᵀA ℓ + Eᵀ λ = 0 and E ℓ = d, with multipliers λ
+    N = rows.T @ rows
+    solved = np.linalg.inv(np.block([[N, E.T], [E, np.zeros((len(E), len(E)))]]))[: len(names)]
+    by_gap, by_d = np.split(solved, [len(names)], axis=1)
+    lengths = by_d @ d
     if np.min(lengths) < MIN_LENGTH:
         shortest = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
         raise NoSolution(f"{recording.where()}: the gap is least with {shortest}; {advice}")
     gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in names]
     correlated = count_correlated_samples(gaps, min_correlation(observations))  # samples that make one independent one
     variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
-    by_z = Z @ np.linalg.solve(Z.T @ rows.T @ rows @ Z, Z.T)
-    by_d = (np.eye(len(names)) - by_z @ rows.T @ rows) @ pinv
-    covariance = correlated * variance * by_z + by_d @ d_cov @ by_d.T
+    covariance = correlated * variance * by_gap + by_d @ d_cov @ by_d.T
     others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
     subject = replace(  # what the prior knows of mounts stays
         prior,

@@ -180,15 +180,12 @@ class CalibrationProblem:
         """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""
         filtered, quat_WL = self.filtered, {}
         for name in (name for name in filtered.R_VS if name in mounts):
-            R_WS_start = self.layout.start_pose.to_world(name, Rotation.from_quat(mounts[name]))
-            R_WV = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_WS_start)])
-            R_WL = R_WV * filtered.R_VS[name][samples] * R_WS_start.inv() * self.start_rotation(name)
-            quat_WL[name] = R_WL.as_quat()
+            R_LS = Rotation.from_quat(mounts[name])
+            psi = compute_heading_offset(filtered.R_VS_start[name], self.layout.start_pose.to_world(name, R_LS))
+            quat_WL[name] = (
+                Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS[name][samples] * R_LS.inv()
+            ).as_quat()
         return quat_WL
-
-    def start_rotation(self, segment: str) -> Rotation:
-        """Return R_WL of a segment in the start pose; L is the segment's frame."""
-        return Rotation.from_matrix(self.layout.start_pose.rotation(segment))
 
     # Samples ----------------------------------------------------------------------------------------------------------
 

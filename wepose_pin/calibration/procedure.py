@@ -255,17 +255,16 @@ def fuse_calibrations(earlier: Subject, subject: Subject, table: BodyTable) -> S
     fused = np.linalg.inv(np.tensordot(shares, K, axes=1))
     mean = fused @ sum(share * each @ own for share, each, own in zip(shares, K, x, strict=True))
 
-    missing = [row for row in shape_rows if row not in subject.order]
-    order = [*subject.order, *missing]
-    covariance = block_diag(subject.covariance, np.zeros((len(missing), len(missing))))
-    at = [order.index(row) for row in shape_rows]
-    rest = [i for i in range(len(order)) if i not in at]
-    gain = covariance[np.ix_(rest, at)] @ K[1]
-    covariance[np.ix_(rest, rest)] += gain @ (fused - C[1]) @ gain.T
-    covariance[np.ix_(rest, at)] = gain @ fused
-    covariance[np.ix_(at, rest)] = covariance[np.ix_(rest, at)].T
-    covariance[np.ix_(at, at)] = fused
-    moved = dict(zip([order[i] for i in rest], gain @ (mean - x[1]), strict=True))
+    order = [*subject.order, *(row for row in shape_rows if row not in subject.order)]
+    missing = len(order) - len(subject.order)
+    covariance, at = (
+        block_diag(subject.covariance, np.zeros((missing, missing))),
+        [order.index(row) for row in shape_rows],
+    )
+    gain = covariance[:, at] @ K[1]
+    gain[at] = np.eye(len(at))
+    covariance += gain @ (fused - covariance[np.ix_(at, at)]) @ gain.T
+    moved = dict(zip(order, gain @ (mean - x[1]), strict=True))
     mounts = {}
     for segment, quat in subject.mounts.items():
         turn = [moved.get(f"mounts.{segment}.{axis}", 0.0) for axis in "xyz"]

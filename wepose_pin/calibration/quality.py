@@ -18,7 +18,7 @@ from ..body.subject import Quality
 from ..body.table import ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences
 from ..recording import format_span
-from .result import MIN_CONTACT, Calibration, CalibrationQuality, Check, QualityLimits
+from .result import MIN_CONTACT, Calibration, CalibrationQuality, Check
 from .weights import CONTRADICTED
 
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
@@ -30,13 +30,13 @@ MOST_INTERVALS = 3  # of an open closure that are named, the longest
 # move it by 30 mm an axis whatever the calibration (docs/people.md): a calibration passes that adds less than
 # that, as one minute of a careful person's joined hands does on simulated people (lengths 9 to 12 mm, headings 3.4 to
 # 4.1 deg).
-LENGTH = QualityLimits(0.012, 0.020)  # [m] of an upper arm, of forearm + hand, of the shoulder width, the scale apart
-ARM_HEADING = QualityLimits(np.deg2rad(4.5), np.deg2rad(7.0))  # [rad]
-TORSO_HEADING = QualityLimits(np.deg2rad(5.5), np.deg2rad(7.0))  # [rad] beyond, tissue adds to it
-OTHER_HEADING = QualityLimits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] of a hand, or by poses, or by one arm
+LENGTH = 0.012, 0.020  # [m] of an upper arm, of forearm + hand, of the shoulder width, the scale apart
+ARM_HEADING = np.deg2rad(4.5), np.deg2rad(7.0)  # [rad]
+TORSO_HEADING = np.deg2rad(5.5), np.deg2rad(7.0)  # [rad] beyond, tissue adds to it
+OTHER_HEADING = np.deg2rad(8.0), np.deg2rad(15.0)  # [rad] of a hand, or by poses, or by one arm
 # Relative. It may move a hand, 0.62 m from its shoulder, by half of what tissue and girdle do, 15 mm: 2.4 %. A taped
 # arm gives 1.2 %, shoulder breadth with stature and sex 2.1 %, stature and sex alone 2.6 %, the population prior 5 %.
-SCALE = QualityLimits(0.024, 0.08)
+SCALE = 0.024, 0.08
 # Limits of a person's limbs, with soft tissue and headings some degrees off.
 BACKWARD = 0.15  # share of samples out of a hinge's range
 SIDEWAYS = np.deg2rad(14.0)  # [rad] rms of a segment off the plane in which it bends
@@ -47,17 +47,17 @@ LEAST_ROTATION = np.deg2rad(8.0)
 # Residuals of the solution.
 # [m] rms while the palms touch: wrists bend, shoulders travel. Careful simulated people have 39 mm, give or take 5, and
 # those with more are no farther off.
-GAP = QualityLimits(0.055, 0.075)
-OPEN_SHARE = QualityLimits(0.10, 0.60)  # share of samples
+GAP = 0.055, 0.075
+OPEN_SHARE = 0.10, 0.60  # share of samples
 # [rad] of a segment in the start pose: forearms hang 13 deg outwards and 12 deg forwards, give or take 5 and 7
 # (docs/people.md): 18 deg off in all, give or take 6.
-TILT = QualityLimits(np.deg2rad(35.0), np.deg2rad(45.0))
-UNUSUAL = QualityLimits(4.0, 6.0)  # standard deviations of a length from the population prior
-POSED = QualityLimits(CONTRADICTED, 8.0)  # of a pose or a bow that is used, from the estimate without it
-MEASURED = QualityLimits(CONTRADICTED, 5.0)  # of a measured length from the estimate without it
-SAMPLES = QualityLimits(6.0, 2.0)  # effective sample size, at least
-ROTATION = QualityLimits(LEAST_ROTATION, 0.0)  # [rad] of the segments, at least
-DOUBT = QualityLimits(1.0, 1.0)  # of the limbs' motion, `measure_doubt`
+TILT = np.deg2rad(35.0), np.deg2rad(45.0)
+UNUSUAL = 4.0, 6.0  # standard deviations of a length from the population prior
+POSED = CONTRADICTED, 8.0  # of a pose or a bow that is used, from the estimate without it
+MEASURED = CONTRADICTED, 5.0  # of a measured length from the estimate without it
+SAMPLES = 6.0, 2.0  # effective sample size, at least
+ROTATION = LEAST_ROTATION, 0.0  # [rad] of the segments, at least
+DOUBT = 1.0, 1.0  # of the limbs' motion, `measure_doubt`
 # A motion smaller than this is the cause of an uncertainty: rms angle [rad] of the torso, or of the segment of a limb
 # that turned least; effective sample size, of which a minute reaches 18.
 ENOUGH_SPINE, ENOUGH_LIMBS = np.deg2rad(8.0), np.deg2rad(20.0)
@@ -69,20 +69,19 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     problem, rotations = calibration.problem, measure_rotations(calibration)
     is_mechanism, checks = problem.model.table.is_mechanism, list[Check]()
     if not is_mechanism:
-        checks.append(_check(_diagnose_labels(calibration), DOUBT))
+        checks.append(_check_labels(calibration))
     for mount in problem.unused_mounts:
-        checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
+        limits = float(mount.limit or 0.0), np.pi
+        checks.append(_check(mount.code, float(mount.value or 0.0), limits, mount.place, **mount.facts))
     if not problem.protocol.closures:  # nothing tells which of them is wrong
-        for phase, deviation in calibration.posed.items():
-            checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
+        checks += [_check("pose-contradicted", off, POSED, phase) for phase, off in calibration.posed.items()]
     if not calibration.exchanged:  # with exchanged sensors all other checks are meaningless
         checks += _check_lengths(calibration, rotations) + _check_headings(calibration, rotations)
         checks += _check_residuals(calibration)
     rotation = float(np.median([*rotations.values()])) if rotations and not is_mechanism else np.inf
     if rotation < LEAST_ROTATION and any(check.quality == "fail" for check in checks):
         # All that fails follows from it.
-        hardly_any = Diagnostic("motion-too-small", INFO, value=rotation, facts={"variant": "soft-tissue"})
-        checks = [_check(hardly_any, ROTATION, quality="fail")]
+        checks = [_check("motion-too-small", rotation, ROTATION, quality="fail", variant="soft-tissue")]
     # What does not pass, the worst first; the cause of several once.
     failing = [check for check in checks if check.quality != "pass"]
     failing.sort(key=lambda check: (check.quality != "fail", -check.excess))
@@ -100,62 +99,77 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     )
 
 
-def _diagnose_labels(calibration: Calibration) -> Diagnostic:
-    """Return the sensors that sit on other segments, or else by how much the limbs move as a person's cannot."""
+def _check(
+    code: str,
+    value: float,
+    limits: tuple[float, float],
+    place: str = "",
+    *,
+    cause: Diagnostic | None = None,
+    quality: Quality | None = None,
+    **facts: float | str,
+) -> Check:
+    """Check a value against its limits; NaN, a value that was not computed, passes. `facts` are of the diagnostic."""
+    passes, poor = limits
+    sign = -1.0 if passes > poor else 1.0
+    quality = quality or ("fail" if sign * value > sign * poor else "poor" if sign * value > sign * passes else "pass")
+    severity = SEVERITY[quality]
+    diagnostic = Diagnostic(code, severity, place, value, float(passes), facts)
+    return Check(diagnostic, quality, passes, poor, None if cause is None else replace(cause, severity=severity))
+
+
+def _check_labels(calibration: Calibration) -> Check:
+    """Check that sensors sit on the segments of their labels, and that the limbs move as a person's."""
     (doubt, joint), order = measure_doubt(calibration), list(calibration.problem.model.table.segments)
     pairs = {tuple(sorted(pair, key=order.index)) for pair in calibration.exchanged.items()}
     if not pairs:
-        return Diagnostic("limb-motion-implausible", ERROR, joint, doubt)
-    place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
-    return Diagnostic("sensors-exchanged", ERROR, place, doubt, facts={"variant": "sides"} if len(pairs) > 1 else {})
-
-
-def _check(
-    diagnostic: Diagnostic, limits: QualityLimits, cause: Diagnostic | None = None, quality: Quality | None = None
-) -> Check:
-    """A check of the diagnostic's value; its severity is that of the quality."""
-    value = float(diagnostic.value if diagnostic.value is not None else np.nan)
-    quality = quality or limits.quality(value)
-    severity = SEVERITY[quality]
-    diagnostic = replace(diagnostic, severity=severity, value=value, limit=float(limits.passes))
-    return Check(diagnostic, quality, limits, None if cause is None else replace(cause, severity=severity))
+        return _check("limb-motion-implausible", doubt, DOUBT, joint)
+    facts = {"variant": "sides"} if len(pairs) > 1 else {}
+    return _check("sensors-exchanged", doubt, DOUBT, ", ".join(f"{a} and {b}" for a, b in sorted(pairs)), **facts)
 
 
 def _check_lengths(calibration: Calibration, rotations: Mapping[str, float]) -> list[Check]:
-    """Checks of the lengths that rotate together in a closure, and of the scale where no closure shows it."""
+    """Check the lengths that rotate together in a closure, and the scale where no closure shows it."""
     problem, subject, checks = calibration.problem, calibration.subject, list[Check]()
-    table, scale_observed = problem.model.table, problem.layout.scale_observed
+    table, prior = problem.model.table, problem.prior
     # Lengths that begin at the root cancel in a closed chain, and are one with a point of W that is not known.
     names = [name for name, length in table.lengths.items() if ROOT not in length.start]
     lengths, shape = np.array([subject.lengths[name] for name in names]), subject.lengths_covariance(names)
-    if len(names) > 1 and not scale_observed:  # errors of the scale change all lengths together
+    if len(names) > 1 and not problem.layout.scale_observed:  # errors of the scale change all lengths together
         shape = shape - np.outer(lengths, lengths) / float(lengths @ np.linalg.solve(shape, lengths))
     for sensor, group in problem.layout.length_groups.items():
         if summed := [name for name in group if name in names]:
             take = np.isin(names, summed).astype(float)
             std = float(np.sqrt(max(take @ shape @ take, 0.0)))
             cause = _find_cause(calibration, rotations, table.segments[sensor].spine)
-            checks.append(_check(Diagnostic("length-uncertain", INFO, " + ".join(summed), std), LENGTH, cause))
-    if not scale_observed:
-        facts: dict[str, float | str] = {"measured": problem.measured_example}
-        checks.append(_check(Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts), SCALE))
-    contradicted = False
-    for name, length in calibration.measured_lengths.items():
-        facts = {"measured": length.metres, "expected": length.expected, "std": length.std}
-        checks.append(_check(Diagnostic("length-contradicted", INFO, name, length.deviation, facts=facts), MEASURED))
-        contradicted |= checks[-1].quality != "pass"
+            checks.append(_check("length-uncertain", std, LENGTH, " + ".join(summed), cause=cause))
+    if not problem.layout.scale_observed:
+        checks.append(_check("scale-uncertain", calibration.scale_std, SCALE, measured=problem.measured_example))
+    measured = [
+        _check(
+            "length-contradicted",
+            own.deviation,
+            MEASURED,
+            name,
+            measured=own.metres,
+            expected=own.expected,
+            std=own.std,
+        )
+        for name, own in calibration.measured_lengths.items()
+    ]
+    checks += measured
     others = [name for name in subject.lengths if name not in problem.measured]
-    if others and not contradicted and not table.is_mechanism:  # all lengths follow a wrong measured one
-        prior = problem.prior
+    # All lengths follow a wrong measured one.
+    if others and not table.is_mechanism and all(check.quality == "pass" for check in measured):
         z = {name: abs(subject.lengths[name] - prior.lengths[name]) / prior.std(name) for name in others}
-        name = max(z, key=lambda n: z[n])
-        facts = {"variant": "estimated", "metres": float(subject.lengths[name])}
-        checks.append(_check(Diagnostic("length-contradicted", INFO, name, z[name], facts=facts), UNUSUAL))
+        name = max(z, key=z.__getitem__)
+        metres = float(subject.lengths[name])
+        checks.append(_check("length-contradicted", z[name], UNUSUAL, name, variant="estimated", metres=metres))
     return checks
 
 
 def _check_headings(calibration: Calibration, rotations: Mapping[str, float]) -> list[Check]:
-    """Checks of the mounts' headings; of a mechanism, its lengths alone tell."""
+    """Check the mounts' headings; of a mechanism, its lengths alone tell."""
     subject, table, checks = calibration.subject, calibration.problem.model.table, list[Check]()
     for segment in () if table.is_mechanism else subject.mounts:
         if f"mounts.{segment}.z" in subject.order:
@@ -163,26 +177,25 @@ def _check_headings(calibration: Calibration, rotations: Mapping[str, float]) ->
             limits = TORSO_HEADING if spine else ARM_HEADING
             if table.segments[segment].rigid_without_sensor or len(calibration.hinge_rms) < 2:
                 limits = OTHER_HEADING
-            uncertain = Diagnostic("mount-heading-uncertain", INFO, segment, subject.std(f"mounts.{segment}.z"))
-            checks.append(_check(uncertain, limits, _find_cause(calibration, rotations, spine)))
+            std, cause = subject.std(f"mounts.{segment}.z"), _find_cause(calibration, rotations, spine)
+            checks.append(_check("mount-heading-uncertain", std, limits, segment, cause=cause))
     return checks
 
 
 def _check_residuals(calibration: Calibration) -> list[Check]:
-    """Checks of the closure and of the start pose."""
+    """Check the closure and the start pose."""
     checks = list[Check]()
     if calibration.problem.protocol.closures:
         share = float(np.mean(calibration.contact[calibration.closed] < MIN_CONTACT))
-        facts = {"intervals": format_longest(calibration.open_intervals)}
         checks += [
-            _check(Diagnostic("closure-gap-large", INFO, value=calibration.rms_gap), GAP),
-            _check(Diagnostic("motion-too-small", INFO, value=calibration.effective_sample_size), SAMPLES),
-            _check(Diagnostic("closure-open", INFO, value=share, facts=facts), OPEN_SHARE),
+            _check("closure-gap-large", calibration.rms_gap, GAP),
+            _check("motion-too-small", calibration.effective_sample_size, SAMPLES),
+            _check("closure-open", share, OPEN_SHARE, intervals=format_longest(calibration.open_intervals)),
         ]
     tilts = {name: float(np.linalg.norm(own[:2])) for name, own in calibration.subject.start_pose_offset.items()}
     if tilts:
         name = max(tilts, key=tilts.__getitem__)
-        checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
+        checks.append(_check("start-pose-off", tilts[name], TILT, name))
     return checks
 
 

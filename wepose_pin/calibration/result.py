@@ -30,25 +30,13 @@ class MeasuredLength(NamedTuple):
         return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
 
 
-class QualityLimits(NamedTuple):
-    """Up to `passes` a value passes, up to `poor` it is poor; from them on where `passes` is the larger one."""
-
-    passes: float
-    poor: float
-
-    def quality(self, value: float) -> Quality:
-        """Pass, poor or fail; NaN, a value that was not computed, passes."""
-        sign = -1.0 if self.passes > self.poor else 1.0
-        value, passes, poor = sign * value, sign * self.passes, sign * self.poor
-        return "fail" if value > poor else "poor" if value > passes else "pass"
-
-
 class Check(NamedTuple):
-    """One number against its limits."""
+    """One number against its limits, from which on it passes, or is poor, where `passes` is the larger one."""
 
-    diagnostic: Diagnostic  # what is checked: its value, and as limit that up to which it passes
+    diagnostic: Diagnostic  # what is checked: its value, and `passes` as limit
     quality: Quality
-    limits: QualityLimits
+    passes: float  # up to which it passes
+    poor: float  # up to which it is poor
     cause: Diagnostic | None = None  # the motion that was too small
 
     @property
@@ -59,14 +47,8 @@ class Check(NamedTuple):
     @property
     def excess(self) -> float:
         """The ratio of value and limit, above 1 where it does not pass."""
-        passes, poor = self.limits
-        value, limit = (passes, self.value) if passes > poor else (self.value, passes)
+        value, limit = (self.passes, self.value) if self.passes > self.poor else (self.value, self.passes)
         return value / max(limit, 1e-9)
-
-
-def find_intervals(time: np.ndarray, mask: np.ndarray) -> list[tuple[float, float]]:
-    """Intervals [s] in which `mask` (n,) bool holds, at times (n,) [s]."""
-    return [(float(time[first]), float(time[last - 1])) for first, last in find_runs(mask)]
 
 
 @dataclass(frozen=True)
@@ -132,8 +114,8 @@ class Calibration:
     @property
     def open_intervals(self) -> list[tuple[float, float]]:
         """Intervals [s] in which the palms were apart."""
-        mask = self.closed & (self.contact < MIN_CONTACT)
-        return [(round(a, 3), round(b, 3)) for a, b in find_intervals(self.time, mask)]
+        runs = find_runs(self.closed & (self.contact < MIN_CONTACT))
+        return [(round(float(self.time[a]), 3), round(float(self.time[b - 1]), 3)) for a, b in runs]
 
     @property
     def rms_gap(self) -> float:

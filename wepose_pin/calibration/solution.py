@@ -137,7 +137,7 @@ def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndar
         girdles={**problem.prior.girdles, **girdles},
         order=order,
         covariance=covariance,
-        mounts={name: (problem.start_rotation(name).inv() * R_WS).as_quat() for name, R_WS in R_WS_start.items()},
+        mounts={name: layout.start_pose.to_segment(name, R_WS).as_quat() for name, R_WS in R_WS_start.items()},
     )
 
 
@@ -155,7 +155,7 @@ def _estimate_hinges(
     for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
         if spans:
             axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
-            axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
+            axis_L = layout.start_pose.rotation(term.on).T @ axis / np.linalg.norm(axis)
             bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
             hinge_rms[term.name] = rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
             std = max(rms, problem.model.table.hinges[term.name].softness)
@@ -173,29 +173,23 @@ def _project_to_subject(
     That of the segment that faces x in the start pose turns the headings of all mounts alike. By how much a person
     turns a segment about the vertical in the start pose is not in them: no closure shows it.
     """
-    K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
-    of_girdles = [f"girdles.{name}.{parameter}" for name in layout.girdles for parameter in PARAMETERS]
-    T = np.zeros((K + len(rows) + len(of_girdles), layout.size))
-    T[:K, :K] = np.eye(K)
-    T[K + len(rows) :, layout.girdle.ravel()] = np.eye(len(of_girdles))
-    for i, name in enumerate(layout.sensors):
-        own = np.zeros((3, layout.size))
-        own[[0, 1], layout.tilt[i]] = -1.0
-        own[2, layout.heading[i]] = 1.0
-        T[K + 3 * i : K + 3 * i + 3] = problem.layout.start_pose.rotation(name).T @ own
-    projected = T @ covariance @ T.T
-    if not problem.model.table.is_mechanism:
+    K, start_pose, table = len(layout.lengths), layout.start_pose, layout.model.table
+    names = [*layout.lengths, *(row for name in layout.sensors for row in mount_rows(name))]
+    names += [f"girdles.{name}.{parameter}" for name in layout.girdles for parameter in PARAMETERS]
+    T, added = np.zeros((len(names), layout.size)), np.zeros((len(names), len(names)))
+    T[:K, layout.length] = np.eye(K)
+    T[len(names) - layout.girdle.size :, layout.girdle.ravel()] = np.eye(layout.girdle.size)
+    if not table.is_mechanism:
         shown = [k for k, name in enumerate(layout.lengths) if name in layout.lengths_in_closures]
-        projected[shown, shown] += JOINT_CENTRE_STD**2
+        added[shown, shown] = JOINT_CENTRE_STD**2
     known = {} if problem.recording.remounted else problem.prior.mounts
-    segments = problem.model.table.segments
-    tissue = {name: scatter * np.array(segment.soft_tissue.std) for name, segment in segments.items()}
-    up = np.zeros(len(projected))  # the vertical of the start pose, in the frames of the new mounts' segments
+    tissue = {name: scatter * np.array(segment.soft_tissue.std) for name, segment in table.segments.items()}
+    up = np.zeros(len(names))  # the vertical of the start pose, in the frames of the new mounts' segments
     for i, name in enumerate(layout.sensors):
+        mount, R_WL = slice(K + 3 * i, K + 3 * i + 3), start_pose.rotation(name)
+        T[mount, layout.tilt[i]], T[mount, layout.heading[i]] = -R_WL[:2].T, R_WL[2]
         if name not in known:
-            mount, R_WL = slice(K + 3 * i, K + 3 * i + 3), problem.layout.start_pose.rotation(name)
             up[mount] = R_WL[2]
             horizontal = R_WL[:2].T @ R_WL[:2]
-            projected[mount, mount] += horizontal @ np.diag(tissue[name] ** 2) @ horizontal
-    projected += tissue[problem.model.table.reference][2] ** 2 * np.outer(up, up)
-    return (*layout.lengths, *rows, *of_girdles), projected
+            added[mount, mount] = horizontal @ np.diag(tissue[name] ** 2) @ horizontal
+    return tuple(names), T @ covariance @ T.T + added + tissue[table.reference][2] ** 2 * np.outer(up, up)

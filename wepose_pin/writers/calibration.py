@@ -33,7 +33,7 @@ def _document(calibration: Calibration) -> dict[str, Any]:
         "diagnostics": [diagnostic_as_json(diagnostic) for diagnostic in quality.diagnostics],
         "checks": [
             {"code": check.diagnostic.code, "place": check.diagnostic.place, "quality": check.quality}
-            | {"value": _number(check.value), "passes": check.limits.passes, "poor": check.limits.poor}
+            | {"value": _number(check.value), "passes": check.passes, "poor": check.poor}
             for check in quality.checks
         ],
         "protocol": calibration.problem.protocol.name,
