@@ -49,7 +49,6 @@ from ..observations.expressions import (
     small_rotation,
 )
 from ..recording import Recording
-from .conditions import resolve_conditions
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 
 GAP_ROWS = 3  # residuals of a sample's condition
@@ -70,7 +69,7 @@ Gaussian = tuple[np.ndarray, np.ndarray]  # a normal distribution of x: mean (m,
 
 
 class Layout:
-    """The unknowns of a protocol on a body, each with its places in x (m,); raise as `resolve_conditions`."""
+    """The unknowns of a protocol on a body, each with its places in x (m,); raise as `Protocol.resolve`."""
 
     length: np.ndarray  # (lengths,) [m]
     heading: np.ndarray  # (sensors,) ψ [rad]
@@ -86,7 +85,7 @@ class Layout:
     def __init__(self, protocol: Protocol, model: BodyModel, recording: Recording) -> None:
         self.protocol, self.model, table = protocol, model, model.table
         self.start_pose = find_start_pose(model, recording)
-        self.conditions, self.paths = resolve_conditions(protocol, model, self.start_pose, recording)
+        self.conditions, self.paths = protocol.resolve(model, self.start_pose, recording)
         used = {segment for paths in self.paths.values() for path in paths for segment in path.segments}
         for condition in self.conditions:
             if isinstance(condition, FreeMotion):

@@ -32,11 +32,10 @@ from ..body.girdle import FIXED
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
-from .least_squares import MIN_LENGTH
+from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples, min_correlation
 from .problem import CalibrationProblem
 from .protocols import Closure
-from .result import Calibration, MeasuredLength
-from .weights import LEAST_VARIANCE, count_correlated_samples, min_correlation
+from .result import Calibration
 
 Formulation = Literal["full", "paper"]
 LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of the change with the largest effect

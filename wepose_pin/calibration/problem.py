@@ -21,14 +21,15 @@ from ..body.mounts import (
 )
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
+from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadPhase
+from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
 from ..observations.joint_accelerations import find_neighbours
-from ..recording import Intervals, Recording, format_span
-from .conditions import find_connected, find_samples, mask_measured, read_recorded_places
-from .couplings import Coupling, estimate_couplings
+from ..recording import Recording, format_span
+from ..recording.gaps import find_runs
 from .equations import Gaussian, Layout
+from .headings import Coupling, estimate_couplings
 from .least_squares import Observations
 from .protocols import Closure, Condition, FreeMotion, Protocol
 
@@ -36,6 +37,7 @@ from .protocols import Closure, Condition, FreeMotion, Protocol
 SAMPLE_RATE_HZ = 8.0
 MOST_SAMPLES = 2000  # of all conditions; longer ones are sampled at a lower rate
 LEAST_S = 1.25  # [s] of each condition, in which all sensors measure
+LONGEST_LOSS_S = 0.1  # [s] over which the rate of an arm is interpolated to some degrees
 FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
 # Standard deviations [rad] of a stated mount's heading, as mounts name sensor axes that are estimated by eye, and of an
 # unknown heading: the whole circle.
@@ -79,22 +81,6 @@ class CalibrationProblem:
         if not names or (self.protocol.measured_example and not self.measured):
             return self.protocol.measured_example
         return f"{max(names, key=self.model.lengths.__getitem__)}=METRES"
-
-    @cached_property
-    def couplings(self) -> list[Coupling]:
-        """The relative headings of neighbours by the acceleration of the joint between them."""
-        moving = [c for c in self.protocol.conditions if isinstance(c, Closure | FreeMotion)]
-        spans = [span for condition in moving for span in self.intervals(condition)]
-        return estimate_couplings(
-            self.recording, self.filtered, find_neighbours(self.model, self.layout.sensors), spans
-        )
-
-    def intervals(self, condition: Condition) -> Intervals:
-        """Return the intervals [s] in which a condition holds; raise `BadPhase` where the recording lacks its phase."""
-        if condition.phase:
-            return self.recording.phase(condition.phase)
-        begin = self.filtered.start[1]
-        return ((begin, min(begin + FREE_S, float(self.recording.time[-1]))),)
 
     # Mounts and labels ------------------------------------------------------------------------------------------------
 
@@ -188,21 +174,58 @@ class CalibrationProblem:
         return quat_WL
 
     # Samples ----------------------------------------------------------------------------------------------------------
+    # After lost samples a filter recovers the tilt from gravity, but never the heading.
 
     @cached_property
     def phase_samples(self) -> list[np.ndarray]:
-        """The numbers of the samples of each condition's phase."""
-        return [find_samples(self.recording, self.intervals(condition)) for condition in self.protocol.conditions]
+        """The numbers of the samples of each condition's phase; `BadPhase` where the recording lacks a phase."""
+        recording, begin, samples = self.recording, self.filtered.start[1], list[np.ndarray]()
+        for condition in self.layout.conditions:
+            free = ((begin, min(begin + FREE_S, float(recording.time[-1]))),)
+            inside = np.zeros(len(recording), dtype=bool)  # each sample counts once where intervals overlap
+            for interval in recording.phase(condition.phase) if condition.phase else free:
+                inside[recording.span(interval)] = True
+            samples.append(np.flatnonzero(inside))
+        return samples
 
     @cached_property
     def connected(self) -> tuple[np.ndarray, str, tuple[float, float]]:
-        """The samples at which no sensor has lost its heading since the start pose, as `find_connected`."""
-        return find_connected(self.recording, self.filtered.start, self.layout.sensors)
+        """The samples (n,) bool between which and the start pose no sensor lost more than `LONGEST_LOSS_S`.
+
+        Beside them the sensor whose loss ends them, else the one after whose loss they begin, and that loss [s]; empty:
+        nothing was lost.
+        """
+        recording, n = self.recording, len(self.recording)
+        begin, longest = recording.span(self.filtered.start).start, LONGEST_LOSS_S * recording.rate_hz
+        gaps = {name: recording.imus[name].gap for name in self.layout.sensors if name in recording.imus}
+        runs = [(a, b, name) for name, gap in gaps.items() if gap is not None for a, b in find_runs(gap)]
+        losses = [(a, b, name) for a, b, name in runs if b - a > longest]
+        before = max((loss for loss in losses if loss[0] < begin), key=lambda loss: loss[1], default=(0, 0, ""))
+        after = min((loss for loss in losses if loss[0] >= begin), default=(n, n, ""))
+        a, b, lost = after if after[2] else before
+        interval = (float(recording.time[a]), float(recording.time[b - 1])) if lost else (np.nan, np.nan)
+        samples = np.arange(n)
+        return (samples >= before[1]) & (samples < after[0]), lost, interval
+
+    @cached_property
+    def usable(self) -> np.ndarray:
+        """(n,) bool: the samples that all sensors measured, and that are connected with the start pose."""
+        gaps = [sensor.gap for sensor in self.recording.sensors.values() if sensor.gap is not None]
+        return self.connected[0] & ~np.any([np.zeros(len(self.recording), dtype=bool), *gaps], axis=0)
+
+    @cached_property
+    def couplings(self) -> list[Coupling]:
+        """The relative headings of neighbours by the acceleration of the joint between them."""
+        phases = zip(self.layout.conditions, self.phase_samples, strict=True)
+        moving = [phase for condition, phase in phases if isinstance(condition, Closure | FreeMotion)]
+        samples = np.unique(np.concatenate([np.zeros(0, dtype=int), *moving]))
+        pairs = find_neighbours(self.model, self.layout.sensors)
+        return estimate_couplings(self.recording, self.filtered, pairs, samples[self.usable[samples]])
 
     def diagnose_losses(self) -> list[Diagnostic]:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
         diagnostics, (connected, lost, loss) = [], self.connected
-        for condition, phase in zip(self.protocol.conditions, self.phase_samples, strict=True):
+        for condition, phase in zip(self.layout.conditions, self.phase_samples, strict=True):
             unused = float(np.sum(~connected[phase])) / self.recording.rate_hz
             if unused:
                 facts = {"phase": _name_phase(condition), "interval": format_span(loss)}
@@ -215,12 +238,11 @@ class CalibrationProblem:
         It raises `BadPhase` where a condition has too few samples with all sensors, connected with the start pose.
         """
         recording, filtered, layout = self.recording, self.filtered, self.layout
-        (connected, lost, loss), conditions = self.connected, layout.conditions
+        (connected, lost, loss), parts, places = self.connected, list[np.ndarray](), list[np.ndarray]()
         stride = max(1, round(recording.rate_hz / rate_hz), sum(map(len, self.phase_samples)) // MOST_SAMPLES)
-        parts, places = [], []
-        for condition, phase in zip(conditions, self.phase_samples, strict=True):
+        for condition, phase in zip(layout.conditions, self.phase_samples, strict=True):
             samples = phase[::stride]
-            samples = samples[mask_measured(recording, recording.sensors, samples) & connected[samples]]
+            samples = samples[self.usable[samples]]
             place = np.zeros((len(samples), 3))
             if isinstance(condition, Closure) and condition.kind == "recorded":
                 place = read_recorded_places(recording, condition, recording.time[samples])
@@ -252,3 +274,26 @@ class CalibrationProblem:
 
 def _name_phase(condition: Condition) -> str:
     return f"phases.{condition.phase}" if condition.phase else "the motion"
+
+
+def read_recorded_places(recording: Recording, closure: Closure, time: np.ndarray) -> np.ndarray:
+    """Return places (n, 3) [m] in W of the closure's point from its origin at `time` (n,) [s]; NaN where it was lost.
+
+    Places are interpolated linearly between two rows of the session's truth file that both have them. It raises where
+    there is no such file, or its columns and times are not as they should be.
+    """
+    [point] = closure.points
+    columns = [f"{point}_{axis}" for axis in "xyz"]
+    if recording.truth is None:
+        raise BadSession(
+            f"{recording.where()}: data.truth is missing; this protocol takes the place of {point} from it, a table "
+            f"with the columns time, {', '.join(columns)}"
+        )
+    table, file, where = read_table(recording.truth), str(recording.truth), f"{recording.where()}: data.truth"
+    known_time = read_columns(table, ["time"], file, where)[:, 0]
+    places = read_columns(table, columns, file, where)
+    if closure.origin:
+        places = places - read_columns(table, [f"{closure.origin}_{axis}" for axis in "xyz"], file, where)
+    if not (np.diff(known_time) > 0.0).all():
+        raise BadSession(f"{where}: time of {recording.truth.name} does not increase from row to row")
+    return np.column_stack([np.interp(time, known_time, column, left=np.nan, right=np.nan) for column in places.T])

@@ -47,8 +47,7 @@ from .equations import Layout
 from .paper import Formulation, solve_paper_calibration
 from .problem import CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
-from .quality import LEAST_ROTATION, assess, measure_doubt, measure_rotations
-from .result import Calibration
+from .result import LEAST_ROTATION, Calibration, assess, measure_doubt, measure_rotations
 from .solution import solve_problem
 
 # One standard deviation [m] of a length measured over the skin, where the user gives none.

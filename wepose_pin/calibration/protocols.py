@@ -25,12 +25,14 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..body import BodyTable, list_breadths
-from ..body.mounts import PALM_SLIP_STD
+from ..body import BodyModel, BodyTable, list_breadths
+from ..body.mounts import PALM_SLIP_STD, StartPose
 from ..body.table import Vector, check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
-from ..errors import BadOption, one_of
+from ..errors import BadOption, BadSession, one_of
 from ..libraries import asset
+from ..observations.expressions import PointPath
+from ..recording import Recording
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
 DEFAULT = "clasp"
@@ -147,6 +149,41 @@ class Protocol:
         measured = self.measured_example.partition("=")[0]
         if measured and measured not in (*table.lengths, *list_breadths(table)):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
+
+    def resolve(
+        self, model: BodyModel, start: StartPose, recording: Recording
+    ) -> tuple[tuple[Condition, ...], dict[Closure, tuple[PointPath, ...]]]:
+        """Return the conditions on this body, their vectors in L', and the paths of each closure.
+
+        It raises `BadSession` for a closure between points that no sensor determines, or a pose without its sensor.
+        """
+        table, sensors, conditions = model.table, recording.sensors, list[Condition]()
+        paths: dict[Closure, tuple[PointPath, ...]] = {}
+        where = f"{recording.where()}: protocol '{self.name}': "
+        for condition in self.conditions:
+            if isinstance(condition, Closure):
+                own = tuple(PointPath(model, start, tuple(sensors), points, where) for points in condition.ways)
+                between = {segment for path in own for segment in path.segments}
+                if len(between) < (2 if condition.kind == "coincide" else 1):
+                    moves = f"only the sensor on {', '.join(between)} moves" if between else "no sensor moves"
+                    points = " and ".join(condition.points)
+                    raise BadSession(f"{where}{moves} {points}; points that move against each other are needed")
+                paths[condition] = own
+            elif not isinstance(condition, FreeMotion):
+                segment = condition.segment
+                for each in (segment, table.reference) if isinstance(condition, Direction) else (segment,):
+                    if each not in sensors:
+                        raise BadSession(f"{where}no sensor on {each}, which a pose or an axis is about")
+                if isinstance(condition, Direction):
+                    condition = condition._replace(
+                        direction=start.turn(table.reference, condition.direction),
+                        reference=table.reference,
+                        along=start.turn(segment, table.segments[segment].along),
+                    )
+                else:
+                    condition = condition._replace(axis=start.turn(segment, condition.axis))
+            conditions.append(condition)
+        return tuple(conditions), paths
 
 
 def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:

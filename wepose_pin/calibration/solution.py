@@ -12,14 +12,20 @@ from ..body.soft_tissue import estimate_scatter
 from ..body.subject import Hinge, Subject, mount_rows
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import NoSolution
-from .couplings import add_couplings
 from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
-from .initial_headings import search_headings
-from .least_squares import MIN_LENGTH, LeastSquares
+from .headings import add_couplings, search_headings
+from .least_squares import (
+    CONTRADICTED,
+    LEAST_LENGTH_STD,
+    MIN_LENGTH,
+    LeastSquares,
+    compare_measured,
+    estimate_covariance,
+    solve_reweighted,
+)
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Closure, FreeMotion
 from .result import Calibration
-from .weights import CONTRADICTED, LEAST_LENGTH_STD, compare_measured, estimate_covariance, solve_reweighted
 
 # [m] to which a length between joint centres is known at best: of simulated people with exact hinges, sums and
 # differences of lengths that were stated to 0.1 mm are off by 0.2 to 1 mm.

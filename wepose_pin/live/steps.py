@@ -14,7 +14,7 @@ import numpy as np
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
-from ..calibration.quality import format_longest
+from ..calibration.result import format_longest
 from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
 from ..recording.arrivals import unpack_orientations

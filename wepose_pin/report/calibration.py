@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration
-from ..calibration.result import MIN_CONTACT
+from ..calibration.least_squares import MIN_CONTACT
 from ..diagnostics import Diagnostic, lines
 from ..errors import WeposeError
 from ..filters import BEST
