@@ -85,12 +85,7 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     """Estimate noise and bias from static samples: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
 
     `worn`: a person wears the sensor and sways. A phase of a second or two does not show sway, so its uncertainty is
-    added to that of the bias.
-
-    Raises
-    ------
-    BadPhase
-        Fewer than 10 samples, or accel without gravity.
+    added to that of the bias. `BadPhase`: fewer than 10 samples, or accel without gravity.
     """
     n = len(gyro_S)
     if n < 10:
@@ -158,18 +153,9 @@ def estimate_start_tilt(
 ) -> tuple[np.ndarray, float]:
     """Estimate `quat_VS` (4,), with zero heading, before the first of some static samples from their mean force.
 
-    The second number is one standard deviation of its roll and of its pitch [rad].
-    The gyroscope rotates each sample's force into the sensor frame of the first, so that sway does not blur the mean.
-    NaN samples are left out.
-
-    Parameters
-    ----------
-    gyro_S, accel_S : (n, 3) [rad/s], (n, 3) [m/s²]
-
-    Raises
-    ------
-    BadData
-        The samples have no gravity.
+    The second number is one standard deviation of its roll and of its pitch [rad]. The gyroscope rotates each sample's
+    force into the sensor frame of the first, so that sway does not blur the mean. NaN samples are left out. `gyro_S`,
+    `accel_S`: (n, 3) [rad/s], [m/s²]. `BadData`: they have no gravity.
     """
     force = rotations.unroll((gyro_S - noise.gyro_bias) * (1.0 / rate_hz), np.ascontiguousarray(accel_S))
     if not np.isfinite(force).all():

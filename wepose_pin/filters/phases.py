@@ -37,22 +37,10 @@ FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 def find_reference_phases(
     recording: Recording, sways: bool
 ) -> tuple[tuple[float, float], tuple[float, float], dict[str, SensorNoise], list[Diagnostic]]:
-    """Find the start pose and each sensor's noise and bias, and check that nothing moves there.
+    """Find the start pose [s], the phase of noise and bias [s], segment → noise of its sensor, and their diagnostics.
 
-    Parameters
-    ----------
-    sways : whether a person stands in the start pose; a mechanism stands still
-
-    Returns
-    -------
-    start, static : [s] the start pose, and the phase of noise and bias
-    noises : segment → noise of its sensor; none of measured orientations
-    diagnostics : of the recording, and of these phases
-
-    Raises
-    ------
-    WeposeError
-        A phase with too few samples, with motion, or without gravity.
+    The noise is that of sensors with a filter; the recording's diagnostics come first. `sways`: a person stands in the
+    start pose; a mechanism stands still. `WeposeError`: a phase with too few samples, with motion, or without gravity.
     """
     stated, lying = recording.phases.get("start", ()), recording.phases.get("static", ())
     if lying and not stated:
@@ -113,10 +101,7 @@ def _find_static_part(
 ) -> tuple[float, float]:
     """Find the longest part [s] of a stated interval in which no sensor moves, and add the diagnostic that says so.
 
-    Raises
-    ------
-    BadPhase
-        The interval has motion in it, and no part of `LEAST_STATIC_S` without.
+    `BadPhase`: the interval has motion in it, and no part of `LEAST_STATIC_S` without.
     """
     span = recording.span(interval)
     size = span.stop - span.start
@@ -215,11 +200,7 @@ def find_static_window(recording: Recording) -> tuple[float, float]:
     """Find the interval [s] of `WINDOW_S` in the first `BEGINNING_S` in which all sensors measure and move least.
 
     A steady rotation about the vertical has no variance: the mean rate that all sensors share counts as motion.
-
-    Raises
-    ------
-    BadPhase
-        Every window has a lost sensor.
+    `BadPhase`: every window has a lost sensor.
     """
     time, rate_hz = recording.time, recording.rate_hz
     n = int(np.searchsorted(time, time[0] + BEGINNING_S, side="right"))

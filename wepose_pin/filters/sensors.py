@@ -83,11 +83,6 @@ class SensorFilters:
     names : the k sensors
     quat_VS, gyro_bias, static, attitude_cov, about_vertical : (k, …) after the last sample, as `Orientation`; the next
         step overwrites them
-
-    Raises
-    ------
-    BadOption
-        An unknown method.
     """
 
     def __init__(
@@ -112,13 +107,7 @@ class SensorFilters:
         self.about_vertical = self._now.about_vertical
 
     def push(self, chunk: Recording) -> dict[str, Orientation]:
-        """Filter a chunk.
-
-        Raises
-        ------
-        BadData
-            The start phase has no gravity.
-        """
+        """Filter a chunk; `BadData`: the start phase has no gravity."""
 
         def run(name: str) -> Orientation:
             return self._filter(name, chunk.imus[name], chunk.rate_hz)
@@ -229,14 +218,8 @@ def start_filters(
 ) -> tuple[SensorFilters, FilteredRecording]:
     """Filter a recording, or the first chunk of one, with the start pose; the filters take the next chunks.
 
-    Parameters
-    ----------
-    sways : whether a person stands in the start pose; a mechanism stands still
-
-    Raises
-    ------
-    WeposeError
-        A start phase with too few samples, or with motion; an unknown method.
+    `sways`: a person stands in the start pose; a mechanism stands still. `WeposeError`: a start phase with too few
+    samples, or with motion; an unknown method.
     """
     start, static, noises, diagnostics = find_reference_phases(first, sways)
     filters = SensorFilters(noises, method=method, static_test=static_test, start=first.span(start))

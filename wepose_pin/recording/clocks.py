@@ -30,20 +30,12 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 @dataclass(frozen=True)
 class Clock:
-    """The times of a sensor with lost rows filled in.
+    """The times of a sensor with lost rows filled in."""
 
-    Parameters
-    ----------
-    time : (n,) [s]
-    row : (n,) row of the file, −1 for a lost row
-    step : the usual step [s]
-    packet : rows in a packet; their times were spread evenly
-    """
-
-    time: np.ndarray
-    row: np.ndarray
-    step: float
-    packet: int = 1
+    time: np.ndarray  # (n,) [s]
+    row: np.ndarray  # (n,) row of the file, −1 for a lost row
+    step: float  # [s] the usual one
+    packet: int = 1  # rows in a packet; their times were spread evenly
 
     @property
     def longest_bridge(self) -> float:
@@ -54,10 +46,7 @@ class Clock:
 def build_clock(time: np.ndarray, place: str) -> Clock:
     """Build the clock of a sensor from the times [s] of its rows; `place` begins an error's text.
 
-    Raises
-    ------
-    BadData
-        Time does not increase, is not in seconds, or jumps by more than the length of the recording.
+    `BadData`: time does not increase, is not in seconds, or jumps by more than the length of the recording.
     """
     if len(time) < 2:
         raise BadData(f"{place}: {len(time)} samples; a recording has at least 2")
@@ -119,10 +108,7 @@ def _spread_packets(time: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def guess_time_unit(step: float) -> str | None:
-    """Guess the unit of a column of times from its usual `step`; None: no unit gives the step of a body sensor.
-
-    Where two units are possible (0.2 to 0.5 s, or ms) it is seconds.
-    """
+    """Guess the unit of a column of times from its usual `step`, seconds if possible; None: no unit fits a sensor."""
     return next((name for name, unit in TIME_UNITS.items() if 1e-4 < step * unit < LONGEST_STEP_S), None)
 
 
@@ -141,12 +127,7 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     """Find one time base (n,) [s] for all sensors, with a diagnostic where they must be resampled.
 
     Sensors with one even clock keep it. Otherwise the time base is even, over the overlap of all clocks, at the rate of
-    the slowest sensor: the motion of faster sensors is summed between samples without loss.
-
-    Raises
-    ------
-    BadData
-        The clocks do not overlap.
+    the slowest sensor: the motion of faster sensors is summed between samples without loss. `BadData`: no overlap.
     """
     distinct = list({id(clock): clock for clock in clocks.values()}.values())  # usually one for all sensors
     first, steps = distinct[0], [np.diff(clock.time) for clock in distinct]

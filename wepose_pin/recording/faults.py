@@ -65,26 +65,16 @@ class Fault(NamedTuple):
 def check_sensors(
     where: str, samples: Mapping[str, tuple[np.ndarray, ...]], start: tuple[float, float] | None
 ) -> tuple[dict[str, list[Fault]], dict[str, float], list[Diagnostic]]:
-    """Check that the sensors measure, and find where they do not.
+    """Return sensor → its faults in order of time, sensor → `find_gyro_range`, and a diagnostic of each frozen sensor.
 
-    Parameters
-    ----------
-    where : the file, for messages
-    samples : sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost
-    start : [s] the stated start pose
-
-    Returns
-    -------
-    faults : sensor → its faults in the order of time
-    gyro_range : sensor → [rad/s] as `find_gyro_range`
-    diagnostics : frozen sensors
-
-    Raises
-    ------
-    BadData
-        Two sensors have the same values, or one is dead in the whole recording or in the start pose.
+    `samples`: sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost. `start` [s]:
+    the stated start pose. `BadData`: two sensors have the same values, or one is dead all along or in the start pose.
     """
-    imus = {name: _take_numbers(*each) for name, each in samples.items() if len(each) == 3}
+    imus = {}
+    for name, each in samples.items():
+        good = np.isfinite(np.hstack(each[1:])).all(axis=1)
+        if len(each) == 3:
+            imus[name] = each if good.all() else tuple(values[good] for values in each)
     for (name, a), (other, b) in combinations(imus.items(), 2):
         if all(map(np.array_equal, a[1:], b[1:])) and np.count_nonzero(~_mark_repeats(*a[1:])) > FROZEN_SAMPLES:
             raise BadData(
@@ -116,25 +106,10 @@ def check_sensors(
     return faults, {name: find_gyro_range(*each[1:]) for name, each in imus.items()}, diagnostics
 
 
-def _take_numbers(time: np.ndarray, *signals: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Take the rows that are numbers; without a copy where all are."""
-    if all(np.isfinite(each).all() for each in signals):
-        return time, *signals
-    good = np.isfinite(np.hstack(signals)).all(axis=1)
-    return time[good], *(each[good] for each in signals)
-
-
 def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list[Fault]]:
-    """Find the intervals in which sensors were frozen or stuck, in the order of time.
+    """Find sensor → the intervals in which it was frozen or stuck, in order of time; a sensor without is left out.
 
-    Parameters
-    ----------
-    samples : sensor → times (n,) [s], gyro (n, 3) [rad/s], accel (n, 3) [m/s²], all numbers
-
-    Returns
-    -------
-    dict
-        Sensor → its faults; sensors without are left out.
+    `samples`: sensor → times (n,) [s], gyro (n, 3) [rad/s], accel (n, 3) [m/s²], all numbers.
     """
     faults: dict[str, list[Fault]] = {}
     for name, (time, *values) in samples.items():
@@ -182,10 +157,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
 
 def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
     """Mark the rows (n,) in which all signals (n, 3) repeat the row before."""
-    repeats = np.ones(len(signals[0]), dtype=np.bool_)
-    for signal in signals:
-        _unmark_changes(np.ascontiguousarray(signal), repeats)
-    return repeats
+    changes = np.logical_or.reduce([signal[1:] != signal[:-1] for signal in signals]).any(axis=1)
+    return np.concatenate([[False], ~changes])
 
 
 @kernel
@@ -201,12 +174,6 @@ def _repeats(values):  # type: ignore[no-untyped-def]
             if last - first >= FROZEN_SAMPLES:
                 return True
     return False
-
-
-@kernel
-def _unmark_changes(values, repeats):  # type: ignore[no-untyped-def]
-    for row in range(len(values)):
-        repeats[row] = repeats[row] and row > 0 and is_same(values[row - 1], values[row])
 
 
 @kernel

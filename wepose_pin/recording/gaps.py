@@ -63,9 +63,8 @@ def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray
 def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
     """Resample a sensor from its own times `clock` (n,) [s] to an even time base `time` (m,) within them.
 
-    The rate is integrated on the sensor's clock, the orientation is interpolated at constant rate in each interval, and
-    differenced again; this preserves total rotation. The specific force is interpolated linearly; on a coarser time
-    base it is averaged over each step, so that noise and impacts between samples do not alias.
+    The rate is integrated, interpolated as an orientation and differenced again, which preserves total rotation. The
+    specific force is interpolated linearly; on a coarser time base it is averaged over each step against aliasing.
     """
     gap = None
     if sensor.gap is not None:

@@ -79,35 +79,24 @@ def select_interval(
 ) -> tuple[float, float] | None:
     """Return the interval [s] that --interval or --phase selects; None: neither is given.
 
-    Parameters
-    ----------
-    time : (n,) [s]; the interval may exceed it by `MOST_BEYOND` samples at each end
-    phases : name → intervals [s]
-    phase : a name; of a phase with several intervals ``NAME:2`` is the second
-
-    Raises
-    ------
-    WrongOption
-        Both are given; the interval is outside the recording; there is no such phase, or it has several intervals.
+    `time` (n,) [s]: the interval may exceed it by `MOST_BEYOND` samples at each end. `phases`: name → intervals [s]; of
+    a phase with several intervals ``NAME:2`` is the second. `WrongOption`: both are given; the interval is outside the
+    recording; there is no such phase, or it has several intervals.
     """
     check_selection(interval, phase)
-    if phase is not None:
-        return _find_phase(phases, phase)
-    if interval is not None and _is_beyond(time, *interval):
-        shown = f"{format_time(interval[0])} {format_time(interval[1])}"
-        raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
-    return interval
-
-
-def _find_phase(phases: Mapping[str, Sequence[tuple[float, float]]], phase: str) -> tuple[float, float]:
+    if phase is None:
+        if interval is not None and _is_beyond(time, *interval):
+            shown = f"{format_time(interval[0])} {format_time(interval[1])}"
+            raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
+        return interval
     name, number = phase, 0
     if phase not in phases and (numbered := re.fullmatch(r"(.+):(\d{1,6})", phase)):
         name, number = numbered[1], int(numbered[2])
-    if not phases.get(name):
-        known = [each for each, intervals in phases.items() if intervals]
+    intervals = phases.get(name, ())
+    if not intervals:
+        known = [each for each in phases if phases[each]]
         choices = one_of(known, name) if known else "the recording has no phases; use --interval FROM TO"
         raise WrongOption("phase", phase, f"the recording has no such phase; {choices}")
-    intervals = phases[name]
     if number > len(intervals) or (number == 0 and (len(intervals) > 1 or name != phase)):
         spans = ", ".join(f"{name}:{k} ({format_span(span)})" for k, span in enumerate(intervals[:5], 1))
         more = f" … {name}:{len(intervals)}" if len(intervals) > 5 else ""

@@ -36,13 +36,7 @@ STEADY, UNTURNED = 0.997, 0.995
 
 
 def check_signals(recording: Recording) -> tuple[Diagnostic, ...]:
-    """Check the sensors' values: units, ranges, and with diagnostics gravity's norm and saturation.
-
-    Raises
-    ------
-    BadData
-        Values of another unit, or beyond the range of any sensor.
-    """
+    """Check the sensors' values: units and ranges (`BadData`), and with diagnostics gravity's norm and saturation."""
     diagnostics: list[Diagnostic] = []
     for segment, sensor in recording.imus.items():
         place = f"{recording.where()}: sensors.{segment}"
@@ -74,7 +68,12 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
     else:
         good = (np.abs(sensor.gyro_S) < sensor.gyro_range).all(axis=1)  # a rate at the limit varies least of all
         good = good if sensor.gap is None else good & ~sensor.gap
-        static = _find_static_second(sensor.gyro_S, good, recording.rate_hz)
+        size = min(len(good), max(2, round(recording.rate_hz)))
+        count = len(good) // size
+        motion = sensor.gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
+        motion[~good[: count * size].reshape(count, size).all(axis=1)] = np.inf
+        second = int(np.argmin(motion))
+        static = np.arange(second * size, (second + 1) * size if np.isfinite(motion[second]) else second * size)
         when = "in the second in which it turns most evenly"
     if len(static) < 2:
         return []
@@ -101,19 +100,6 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
         return []
     facts = {"norm": norm, "start": first, "end": last}
     return [Diagnostic("accel-scale", WARNING, segment, share, GRAVITY_ERROR_NOTED, facts)]
-
-
-def _find_static_second(gyro_S: np.ndarray, good: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Find the samples of the second, without any that is not `good` (n,), in which the rate (n, 3) varies least.
-
-    They are none where each second has a sample that is not good.
-    """
-    size = min(len(gyro_S), max(2, round(rate_hz)))
-    count = len(gyro_S) // size
-    motion = gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
-    motion[~good[: count * size].reshape(count, size).all(axis=1)] = np.inf
-    first = int(np.argmin(motion))
-    return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
 def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
@@ -150,9 +136,9 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
 
 
 def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
-    """Find the largest rate [rad/s] of a sensor whose gyroscope turns gravity and whose accelerometer does not.
+    """Find the largest rate [rad/s] of a sensor whose gyroscope turns gravity and whose accelerometer does not, or NaN.
 
-    NaN: they agree. The samples (n, 3) are some seconds without gaps; the unit of `accel_S` does not matter.
+    The samples (n, 3) are some seconds without gaps; the unit of `accel_S` does not matter.
     """
     turns, force = gyro_S[None] / rate_hz, float(np.linalg.norm(accel_S, axis=1).mean())
     steady, turned = (_average_force(scale * turns, accel_S[None])[0] for scale in (0.0, 1.0))

@@ -200,13 +200,7 @@ class Recording:
             first, last = last, last + size
 
     def phase(self, name: str) -> Intervals:
-        """Return the intervals of a phase.
-
-        Raises
-        ------
-        BadPhase
-            The recording does not have the phase.
-        """
+        """Return the intervals of a phase; `BadPhase`: the recording does not have it."""
         intervals = self.phases.get(name, ())
         if not intervals:
             live = bool(self.source) and str(self.source).endswith(".mcap")
@@ -231,14 +225,8 @@ def join_recordings(first: Recording, second: Recording) -> Recording:
 def check_recording(recording: Recording) -> Recording:
     """Check a recording and return it.
 
-    Raises
-    ------
-    BadOption
-        A field has a wrong type, or a name is not known.
-    BadData
-        Shapes differ, samples are too few, a number is not finite, time does not increase or contradicts the rate.
-    BadPhase
-        A phase is empty or outside the recording.
+    `BadOption`: a field has a wrong type. `BadData`: shapes differ, samples are too few, a number is not finite, time
+    does not increase or contradicts the rate. `BadPhase`: a phase is empty or outside the recording.
     """
     where, time = recording.where(), recording.time
     check_fields(recording, f"{where}: ")
