@@ -13,7 +13,10 @@ _PAD = 3  # times the length of the filter, by which the signal is continued bey
 
 
 def low_pass(values: np.ndarray, cutoff_hz: float, rate_hz: float, pad: int | None = None) -> np.ndarray:
-    """Signals (n, …) without what is faster than `cutoff_hz`, mirrored beyond their ends by `pad` < n, None: as SciPy."""
+    """Signals (n, …) without what is faster than `cutoff_hz`; their ends are mirrored by `pad` samples.
+
+    `pad` < n; None: as SciPy.
+    """
     return _filter_both_ways(_design((None, cutoff_hz), rate_hz), values, pad)
 
 

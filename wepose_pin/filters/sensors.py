@@ -20,8 +20,7 @@ from .base import Orientation, OrientationFilter, as_rows, count_processors, mak
 from .complementary import GDC, NCF
 from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
 from .phases import find_reference_phases
-from .published import PUBLISHED_SMEKF
-from .smekf import SMEKF, SmekfParams
+from .smekf import PUBLISHED_SMEKF, SMEKF, SmekfParams
 from .smoother import SMOOTHER
 from .static import USUAL_TEST, StaticTest, find_static, make_static_records
 

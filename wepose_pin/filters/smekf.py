@@ -1,6 +1,6 @@
 """sMEKF: the multiplicative Kalman filter that corrects in static phases alone (Lisini Baldi 2019, Algorithm 1).
 
-One thing differs from the paper, which works to first order (`published`). Its transition Φ = I − [ω δt]× lets the
+One thing differs from the paper, which works to first order (`_run_published`). Its transition Φ = I − [ω δt]× lets the
 standard deviation grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s. Its corrections rotate
 the attitude and not the covariance, so that static phases seem to measure the heading. Over two minutes of simulated
 motion with static phases the rms heading error is 0.57 deg as published and 0.10 deg here.
@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arguments import NonNegative, PositiveOrInfinite
-from ..compilation import fma, inlined, kernel
-from ..recording.limits import HIGHEST_ACCEL_SQUARED
-from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
+from ..compilation import compiled, fma, inlined, kernel
+from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
+from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector, rotate_unit_by_rate, up_in_sensor
 from .base import (
     HEADING,
     RATE,
@@ -160,8 +160,8 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         state.turned += dt * (R[2, 0] * wx + R[2, 1] * wy + R[2, 2] * wz)
         into_sensor(R, A, 0.0, model.scale_var * state.turned * state.turned, out_cov[k])
         x, y, z = R[2, 0], R[2, 1], R[2, 2]
-        vertical[RATE_VAR] = B[0] * x * x + B[4] * y * y + B[8] * z * z
-        vertical[RATE_VAR] += 2.0 * (B[1] * x * y + B[2] * x * z + B[5] * y * z)
+        vertical[RATE_VAR] = fma(x, fma(B[0], x, 2.0 * fma(B[1], y, B[2] * z)), y * fma(B[4], y, 2.0 * B[5] * z))
+        vertical[RATE_VAR] += B[8] * z * z
         for i in range(3):
             out_bias[k, i], out_vertical[k, i] = bias[i], vertical[i]
         for i in range(4):
@@ -206,3 +206,63 @@ def _make_records(
 
 # While gyro is lost, its last rate is held and fades, and `attitude_cov` grows by the motion that may have been missed.
 SMEKF = OrientationFilter(_make_records, _run, SmekfParams)
+
+
+# As published, to the first order -------------------------------------------------------------------------------------
+#
+# The state is x = [a; b], a on the right of `quat_VS`, in S. Measurement model: gyro = ω + b + w_ω, accel/g = R_VSᵀ e_z
+# + w_g. Σ_ω and Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk.
+
+START_VAR = 1e-3  # [rad²], [rad²/s²] P₀ of the authors' software
+
+
+@compiled
+def _run_published(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
+    quat, bias, P, vertical = states[0].quat_VS, states[0].gyro_bias, states[0].P, states[0].about_vertical
+    dt, Q, R, identity = models[0].dt, models[0].Q, models[0].R, np.eye(6)
+    F, H = np.eye(6), np.zeros((6, 6))
+    F[:3, 3:], H[3:, 3:] = -dt * identity[:3, :3], identity[:3, :3]
+    for k in range(len(gyro_S)):
+        w, accel = gyro_S[k] - bias, accel_S[k] / models[0].gravity
+        if np.sum(gyro_S[k] ** 2) < HIGHEST_RATE_SQUARED:  # false for NaN
+            rotate_by_vector(quat, w[0] * dt, w[1] * dt, w[2] * dt)
+            _fill_cross(F, -dt * w, 1.0)  # I − [ω δt]×
+            P[:] = F @ P @ F.T + dt * dt * Q
+            up = np.array(up_in_sensor(quat))
+            if static[k] and np.sum(accel**2) < np.inf:
+                _fill_cross(H, up, 0.0)
+                K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+                x = K @ np.concatenate((accel - up, w))
+                P[:] = (identity - K @ H) @ P
+                rotate_by_vector(quat, x[0], x[1], x[2])
+                bias += x[3:]
+                vertical[HEADING] += np.dot(up, x[:3])
+                vertical[RATE] += np.dot(up, x[3:])
+            vertical[RATE_VAR] = np.dot(up, np.ascontiguousarray(P[3:, 3:]) @ up)
+        out_quat[k], out_bias[k], out_cov[k], out_vertical[k] = quat, bias, P[:3, :3], vertical
+
+
+@compiled
+def _fill_cross(A, v, diagonal):  # type: ignore[no-untyped-def]
+    """Fill the upper left block of `A` with [v]× + diagonal I."""
+    A[0, 0] = A[1, 1] = A[2, 2] = diagonal
+    A[0, 1], A[0, 2], A[1, 0] = -v[2], v[1], v[2]
+    A[1, 2], A[2, 0], A[2, 1] = -v[0], -v[1], v[0]
+
+
+def _make_published_records(
+    noise: SensorNoise,
+    rate_hz: float,
+    quat_VS: np.ndarray,
+    params: None,  # noqa: ARG001
+) -> tuple[np.ndarray, ...]:
+    Q, R = np.zeros((6, 6)), np.zeros((6, 6))
+    Q[:3, :3], Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov  # of [w_ω; w_b]
+    R[:3, :3], R[3:, 3:] = noise.accel_cov, noise.gyro_cov  # of [w_g; w_ω]
+    P = START_VAR * np.eye(6)
+    state = make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias, P=P, about_vertical=np.zeros(3))
+    return state, make_record(dt=1.0 / rate_hz, gravity=noise.gravity, Q=Q, R=R)
+
+
+# With the covariances of the authors' software, and in `sensors` with the paper's static test.
+PUBLISHED_SMEKF = OrientationFilter(_make_published_records, _run_published)
