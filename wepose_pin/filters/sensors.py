@@ -48,12 +48,9 @@ def check_method(method: str) -> str:
 _Bind = Callable[[np.ndarray, np.ndarray, Orientation], list[Callable[[], None]]]
 
 
-def _start_filter(
-    filter_: OrientationFilter, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: Any, test: StaticTest
+def _bind_later(
+    filter_: OrientationFilter, records: tuple[np.ndarray, ...], static_records: tuple[np.ndarray, ...]
 ) -> _Bind:
-    static_records = make_static_records(noise, rate_hz, test)
-    records = filter_.make_records(noise, rate_hz, quat_VS, params)
-
     def bind(gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> list[Callable[[], None]]:
         samples, covariances = (gyro_S, accel_S, out.static), (out.attitude_cov, out.about_vertical)
         filled = (out.quat_VS, out.gyro_bias, *(covariances if filter_.has_covariance else ()))
@@ -172,22 +169,27 @@ class SensorFilters:
             tilt_std = MOVING_TILT_STD
         first = int(phase.start)
 
-        def start(method: str, noise: SensorNoise, quat_VS: np.ndarray) -> _Bind:
+        def start(
+            method: str, noise: SensorNoise, quat_VS: np.ndarray, static_records: tuple[np.ndarray, ...]
+        ) -> _Bind:
             filter_, params = METHODS[method], self._params
             if filter_.params_type in (AmekfParams, SmekfParams):
                 params = params or filter_.params_type(tilt_std=tilt_std)
                 params = replace(params, gyro_range=gyro_range) if gyro_range < params.gyro_range else params
             elif params is None and filter_.params_type is not None:
                 params = filter_.params_type()
-            return _start_filter(filter_, noise, rate_hz, quat_VS, params, self._test)
+            return _bind_later(filter_, filter_.make_records(noise, rate_hz, quat_VS, params), static_records)
 
+        static_records = make_static_records(noise, rate_hz, self._test)
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
             turn = np.nan_to_num(gyro_S[first] - noise.gyro_bias) / rate_hz
             mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
             gyro, accel = as_rows(-gyro_S[first:0:-1]), as_rows(accel_S[first - 1 :: -1])
             method = BEST if self._method in OFFLINE else self._method
             run = make_orientation(first, mirrored, covariance=METHODS[method].has_covariance)
-            for call in start(method, mirrored, rotations.turned(quat_VS, turn))(gyro, accel, run):
+            backward = tuple(record.copy() for record in static_records)
+            backward[0]["bias"] *= -1.0
+            for call in start(method, mirrored, rotations.turned(quat_VS, turn), backward)(gyro, accel, run):
                 call()
             for field, values in run.sampled().items():
                 getattr(out, field)[:first] = values[::-1]
@@ -197,7 +199,7 @@ class SensorFilters:
             if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
                 turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
                 quat_VS, tilt_std = rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD
-        self._filters[name] = start(self._method, noise, quat_VS)
+        self._filters[name] = start(self._method, noise, quat_VS, static_records)
         return first
 
 

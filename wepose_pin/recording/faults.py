@@ -70,11 +70,10 @@ def check_sensors(
     `samples`: sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost. `start` [s]:
     the stated start pose. `BadData`: two sensors have the same values, or one is dead all along or in the start pose.
     """
-    imus = {}
-    for name, each in samples.items():
-        good = np.isfinite(np.hstack(each[1:])).all(axis=1)
-        if len(each) == 3:
-            imus[name] = each if good.all() else tuple(values[good] for values in each)
+    imus = {name: arrays for name, arrays in samples.items() if len(arrays) == 3}
+    for name, arrays in imus.items():
+        good = np.isfinite(np.hstack(arrays[1:])).all(axis=1)
+        imus[name] = arrays if good.all() else tuple(values[good] for values in arrays)
     for (name, a), (other, b) in combinations(imus.items(), 2):
         if all(map(np.array_equal, a[1:], b[1:])) and np.count_nonzero(~_mark_repeats(*a[1:])) > FROZEN_SAMPLES:
             raise BadData(
