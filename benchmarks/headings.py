@@ -27,6 +27,7 @@ from wepose_pin.simulation.motion import TASKS, Motion, aim_ray
 from wepose_pin.simulation.people import place_shoulder
 from wepose_pin.simulation.signals import Wander, make_pulse
 from wepose_pin.tracking import Tracker, TrackResult, track, track_chunks
+from wepose_pin.tracking.headings import HeadingCorrection
 
 from .tables import Column, Section, Table
 
@@ -175,9 +176,15 @@ def compare_headings(
     for limb in LIMBS:
         for near, far in pairwise(limb):
             error = np.angle(np.exp(1j * (np.concatenate(headings[near]) - np.concatenate(headings[far]))))
-            std = np.nan if each.correction is None else each.correction.relative_std(near, far, time)
+            std = np.nan if each.correction is None else find_relative_std(each.correction, near, far, time)
             result[f"{far} to {near}"] = time, error, std
     return result
+
+
+def find_relative_std(correction: HeadingCorrection, near: str, far: str, time: np.ndarray) -> np.ndarray:
+    """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
+    signs = np.array([(name == near) - float(name == far) for name in correction.filter.names])
+    return np.sqrt(np.interp(time, correction.time, correction.covariance @ signs @ signs))
 
 
 def measure_live_headings(minutes: float) -> Table:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -50,8 +49,6 @@ SAMPLE_RATE_HZ = 8.0
 # Standard deviation of the delay of an accelerometer against its gyroscope: half a sample, over which it averages, and
 # what filters inside the chips differ by [s]; assumption.
 AVERAGED_SAMPLES, CHIP_DELAY_STD = 0.5, 0.002
-
-
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
 # The heading variance of an orientation filter leaps where a knot adds more than this many times the largest recent
@@ -76,40 +73,23 @@ _JOINT_JACOBIAN = np.zeros((15, 17))
 _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 
 
-@dataclass(frozen=True)
-class HeadingNoise:
-    """Standard deviations, power spectral densities and correlation times of the heading filter: those of a person."""
-
-    drift_psd: float = float(np.deg2rad(0.12) ** 2)  # [rad²/s] of a heading in motion: scale errors, soft tissue
-    rate_std: float = float(np.deg2rad(0.05))  # [rad/s] at which a heading drifts, apart from its gyroscope's bias
-    rate_change_psd: float = float(np.deg2rad(0.1) ** 2 / 900.0)  # [rad²/s³] a sensor warms up under its strap
-    # [rad] of the heading by a joint's acceleration: soft tissue and a travelling shoulder follow the motion.
-    joint_std: float = float(np.deg2rad(0.5))
-    girdle_std: float = float(np.deg2rad(0.9))
-    joint_correlation_s: float = 60.0
-    acceleration_std: float = 0.07  # [m/s²] least misfit of a joint's accelerations; the recent one where it is larger
-    acceleration_correlation_s: float = 0.4
-    # [m/s²] fixed in the sensor's frame: the tilt error of an orientation filter in motion, a degree, times gravity.
-    force_std: float = float(np.deg2rad(1.0) * 9.81)
-    force_correlation_s: float = 20.0
-    twist_std: float = float(np.deg2rad(7.0))  # [rad] of a sensor about its segment's long axis by soft tissue
-    twist_correlation_s: float = 4.0
-    hinge_std: float = float(np.deg2rad(4.0))  # [rad] other errors between a hinge's plane and the segment below
-    hinge_correlation_s: float = 5.0
-    # [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
-    axis_std: float = float(np.deg2rad(5.0))
-    tilt_std: float = float(np.deg2rad(2.0))
-    range_std: float = float(np.deg2rad(10.0))  # [rad] of the limits of a hinge's range
-    closure_correlation_s: float = 20.0
-
-
-PERSON_NOISE = HeadingNoise()
-MECHANISM_NOISE = HeadingNoise(
-    rate_std=float(np.deg2rad(0.2)),
-    girdle_std=float(np.deg2rad(0.5)),
-    twist_std=float(np.deg2rad(0.5)),
-    hinge_std=float(np.deg2rad(0.5)),
-)
+# Standard deviations, power spectral densities and correlation times.
+DRIFT_PSD = np.deg2rad(0.12) ** 2  # [rad²/s] of a heading in motion: scale errors, soft tissue
+RATE_CHANGE_PSD = np.deg2rad(0.1) ** 2 / 900.0  # [rad²/s³] a sensor warms up under its strap
+# [rad] of the heading by a joint's acceleration: soft tissue follows the motion.
+JOINT_STD, JOINT_CORRELATION_S = np.deg2rad(0.5), 60.0
+# [m/s²] least misfit of a joint's accelerations; the recent one where it is larger.
+ACCELERATION_STD, ACCELERATION_CORRELATION_S = 0.07, 0.4
+# [m/s²] fixed in the sensor's frame: the tilt error of an orientation filter in motion, a degree, times gravity.
+FORCE_STD, FORCE_CORRELATION_S = np.deg2rad(1.0) * 9.81, 20.0
+TWIST_CORRELATION_S, HINGE_CORRELATION_S, CLOSURE_CORRELATION_S = 4.0, 5.0, 20.0
+# [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
+AXIS_STD, TILT_STD = float(np.deg2rad(5.0)), float(np.deg2rad(2.0))
+RANGE_STD = np.deg2rad(10.0)  # [rad] of the limits of a hinge's range
+# Those of a person and of a mechanism, in this order: [rad/s] at which a heading drifts, apart from its gyroscope's
+# bias; [rad] of the heading by the acceleration of a joint that travels, as a shoulder; [rad] of a sensor about its
+# segment's long axis by soft tissue; [rad] of other errors between a hinge's plane and the segment below.
+RATE_STD, GIRDLE_STD, TWIST_STD, HINGE_STD = np.deg2rad([[0.05, 0.2], [0.9, 0.5], [7.0, 0.5], [4.0, 0.5]])
 
 
 class HeadingFilter:
@@ -149,11 +129,12 @@ class HeadingFilter:
         causal: bool,
     ) -> None:
         self.names, self.causal, self._last, k = tuple(quat_LS), causal, start, len(quat_LS)
-        self.noise = noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
+        kind = int(model.table.is_mechanism)
+        self._rate_var, hinge_std = RATE_STD[kind] ** 2, float(HINGE_STD[kind])
         raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
         self.measured = np.array([name not in raw for name in self.names])
         self.pairs = find_joint_pairs(model, raw) if first.rate_hz >= LEAST_RATE_HZ else ()
-        self.hinges, axis_std, tilt_std, self._hinge_std = _find_hinges(first, self.names, subject, model, noise)
+        self.hinges, axis_std, tilt_std, self._hinge_std = _find_hinges(first, self.names, subject, model, hinge_std)
         [closure] = load_protocol(CLASP).closures
         self.palms, (left, right) = None, closure.points
         if {left, right} <= set(model.table.points):
@@ -171,31 +152,33 @@ class HeadingFilter:
         self.quat_SL = (neutral * mounts).inv().as_quat()  # (k, 4) xyzw, from L' to the sensor
         # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
         # gyroscope's bias, or the drift of measured orientations.
-        self._drift_psd, rate_std = np.full(k, noise.drift_psd), np.full(k, MEASURED_RATE_STD)
+        self._drift_psd, rate_std = np.full(k, DRIFT_PSD), np.full(k, MEASURED_RATE_STD)
+        self.start_var, self.mount_var = np.full(k, REFERENCE_START_STD**2), np.full(k, LEAST_MOUNT_VAR)
         for i, name in enumerate(self.names):
             if name in noises:  # a gyroscope's white noise may be more
                 gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
-                self._drift_psd[i] = max(noise.drift_psd, gyro_psd)
+                self._drift_psd[i] = max(DRIFT_PSD, gyro_psd)
                 rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
-        self.start_var, self.mount_var = np.array(
-            [_find_start_variances(first, name, subject, model) for name in self.names]
-        ).T
+            if name != model.table.reference:
+                self.start_var[i] = compute_start_heading_var(first, name, subject, StartPose(table=model.table))
+            if (mount_cov := find_mount_covariance(first, name, subject)) is not None:
+                self.mount_var[i] = max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
         h, always, known = len(self.hinges), np.inf, np.sqrt(start[3])
-        rate_std = np.hypot(noise.rate_std, np.where(np.isfinite(known), known, rate_std))
-        joint_std = np.array([noise.girdle_std if pair.travels else noise.joint_std for pair in self.pairs])
+        rate_std = np.hypot(RATE_STD[kind], np.where(np.isfinite(known), known, rate_std))
+        joint_std = np.array([GIRDLE_STD[kind] if pair.travels else JOINT_STD for pair in self.pairs])
         lever_std = np.array([[pair.lever_std] * 6 for pair in self.pairs]).reshape(-1, 6)
-        twist_std, force_std = np.full(h, noise.twist_std), np.full((k, 3), noise.force_std)
+        twist_std, force_std = np.full(h, TWIST_STD[kind]), np.full((k, 3), FORCE_STD)
         delay_std = np.full(k, AVERAGED_SAMPLES / first.rate_hz + CHIP_DELAY_STD)
         states = {
             "heading": (np.zeros(k), always),  # δ [rad]
             "rate": (rate_std, always),  # [rad/s] at which δ drifts
-            "joint": (joint_std, noise.joint_correlation_s),  # [rad] of the heading by a joint's acceleration
+            "joint": (joint_std, JOINT_CORRELATION_S),  # [rad] of the heading by a joint's acceleration
             "axis": (axis_std, always),  # [rad] of a hinge about the long axis of the segment above
-            "twist": (twist_std, noise.twist_correlation_s),  # [rad] of that segment's sensor, the same
+            "twist": (twist_std, TWIST_CORRELATION_S),  # [rad] of that segment's sensor, the same
             "tilt": (tilt_std, always),  # [rad] of a hinge about the direction across
             "mount": (np.zeros(k), always),  # [rad] of a mount's heading
-            "force": (force_std, noise.force_correlation_s),  # [m/s²] fixed in the sensor's frame
+            "force": (force_std, FORCE_CORRELATION_S),  # [m/s²] fixed in the sensor's frame
             "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
             "start": (np.zeros(k), always),  # [rad] of the segment's heading in the start pose
             "lever": (lever_std, always),  # [m] of the near and the far sensor from the joint
@@ -208,7 +191,7 @@ class HeadingFilter:
         std = np.concatenate([std.ravel() for std, _ in states.values()])
         self._decay = np.concatenate([np.full(std.size, np.exp(-self.knot_s / t)) for std, t in states.values()])
         self._process_var = (1.0 - self._decay**2) * std**2
-        self._process_var[c["rate"]] = noise.rate_change_psd * self.knot_s
+        self._process_var[c["rate"]] = RATE_CHANGE_PSD * self.knot_s
         self.x, self.P = np.zeros(len(std)), np.diag(std**2)
         index = self.names.index
         self._pair_columns = []  # (17,) each: headings of its segments, joint; lever, force and delay near and far
@@ -277,7 +260,7 @@ class HeadingFilter:
             yield
             yield from self._add_hinges(x, quat_WL, unreliable)
             if palms is not None:
-                correlated = max(1.0, self.noise.closure_correlation_s * self.rate_hz)
+                correlated = max(1.0, CLOSURE_CORRELATION_S * self.rate_hz)
                 if self.causal and not self._clasped_before:
                     # Causally all of a clasp's first knot is one observation: a clasp may be shorter than that.
                     correlated = float(len(quat_WL))
@@ -339,7 +322,7 @@ class HeadingFilter:
         A filter that corrects a bias by c while its variance falls from v to v (1 − K) has observed c/K with the
         variance v (1 − K)/K. The rate here already has c; it is the bias and `rate_std`, which is no bias.
         """
-        columns, other_var = self._columns["rate"], self.noise.rate_std**2
+        columns, other_var = self._columns["rate"], self._rate_var
         rate_var, last_rate_var = filters[3] + other_var, self._last[3] + other_var
         learned = 1.0 - rate_var / last_rate_var
         learns = learned > LEAST_LEARNED  # false for NaN
@@ -351,7 +334,7 @@ class HeadingFilter:
     def _add_joints(self, x: np.ndarray, sides: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Add the accelerations of joints; return the recent misfits with those of the knot."""
         misfits = self._misfits.copy()
-        correlated = max(1.0, self.noise.acceleration_correlation_s * self.rate_hz)
+        correlated = max(1.0, ACCELERATION_CORRELATION_S * self.rate_hz)
         decay = np.exp(-self.knot_s / MISFIT_MEMORY_S)
         for misfit, columns in zip(misfits, self._pair_columns, strict=True):
             near, far, joint = columns[:3]
@@ -363,7 +346,7 @@ class HeadingFilter:
             misfit[:] = decay * misfit + np.concatenate(sums)
             r, H = e.ravel(), jacobian.reshape(-1, len(_JOINT_JACOBIAN)) @ _JOINT_JACOBIAN
             variance, coherent_var = _split_misfit(misfit, correlated)
-            least_var = self.noise.acceleration_std**2
+            least_var = ACCELERATION_STD**2
             weight = 1.0 / (max(float(np.mean(r**2)), variance, least_var) * correlated)
             # What is coherent counts as one observation over the time that is remembered.
             weight /= 1.0 + weight * float(H[:, 0] @ H[:, 0]) * coherent_var * (misfit[-1] / len(e))
@@ -372,8 +355,7 @@ class HeadingFilter:
 
     def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> Iterator[None]:
         """Add the hinges and their ranges; yield between them."""
-        noise = self.noise
-        samples = max(1.0, noise.hinge_correlation_s * self.rate_hz)
+        samples = max(1.0, HINGE_CORRELATION_S * self.rate_hz)
         for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
             moves, on = columns[:2]
             if unreliable[on] or unreliable[moves]:
@@ -383,7 +365,7 @@ class HeadingFilter:
             r = r + H[:, 2:] @ x[columns[2:]]
             is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
             self._add(columns, H, r, is_inlier / (std**2 * samples))
-            beyond = (excess != 0.0) / (noise.range_std**2 * samples)
+            beyond = (excess != 0.0) / (RANGE_STD**2 * samples)
             self._add(columns[:2], slope[:, None] * [1.0, -1.0], excess, beyond)
             yield
 
@@ -457,12 +439,12 @@ def _split_misfit(misfit: np.ndarray, correlated_samples: float) -> tuple[float,
 
 
 def _find_hinges(
-    first: Recording, names: tuple[str, ...], subject: Subject, model: BodyModel, noise: HeadingNoise
+    first: Recording, names: tuple[str, ...], subject: Subject, model: BodyModel, hinge_std: float
 ) -> tuple[tuple[HingePlane, ...], np.ndarray, np.ndarray, np.ndarray]:
     """Find the h hinges between two sensors, and standard deviations (h,) [rad] of three errors.
 
-    They are of the axis about the long axis of the segment above and across, as in `HeadingNoise`, and of the angle
-    between the hinge's plane and the segment below.
+    They are of the axis about the long axis of the segment above and across, and of the angle between the hinge's plane
+    and the segment below, at least `hinge_std`.
     """
     # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
     start, calibrated = StartPose(model.neutral_rotations), {} if first.remounted else subject.hinges
@@ -472,23 +454,13 @@ def _find_hinges(
         if plane.name in calibrated:
             axis, std = start.turn(plane.on, calibrated[plane.name].axis), calibrated[plane.name].std
             hinges.append(plane._replace(axis=axis))
-            stds.append((noise.axis_std, noise.tilt_std, max(std, noise.hinge_std)))
+            stds.append((AXIS_STD, TILT_STD, max(std, hinge_std)))
         elif not model.table.is_mechanism:
             hinges.append(plane)
             axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
-            stds.append((axis_std, hinge.tilt_std, max(hinge.softness, noise.hinge_std)))
+            stds.append((axis_std, hinge.tilt_std, max(hinge.softness, hinge_std)))
     axis_stds, tilt_stds, plane_stds = np.array(stds).reshape(-1, 3).T
     return tuple(hinges), axis_stds, tilt_stds, plane_stds
-
-
-def _find_start_variances(first: Recording, segment: str, subject: Subject, model: BodyModel) -> tuple[float, float]:
-    """Find the variances [rad²] of a sensor's heading after the start pose: by the pose, and by the mount's heading."""
-    table = model.table
-    mount_cov = find_mount_covariance(first, segment, subject)
-    mount_var = LEAST_MOUNT_VAR if mount_cov is None else max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
-    if segment == table.reference:
-        return float(REFERENCE_START_STD**2), mount_var
-    return compute_start_heading_var(first, segment, subject, StartPose(table=table)), mount_var
 
 
 def symmetric(P: np.ndarray) -> np.ndarray:

@@ -37,14 +37,10 @@ class HeadingCorrection:
     segment_covariance: np.ndarray  # (m, k, k) [rad²] of the segments' headings
 
     @property
-    def segments(self) -> tuple[str, ...]:
-        return self.filter.names
-
-    @property
     def max_correction_deg(self) -> dict[str, float]:
         """Segment → largest rotation about the vertical."""
         largest = np.degrees(np.max(np.abs(self.errors), axis=0, initial=0.0))
-        return dict(zip(self.segments, largest.tolist(), strict=True))
+        return dict(zip(self.filter.names, largest.tolist(), strict=True))
 
     def summarize(self) -> dict[str, Any]:
         """What was observed and the largest correction of each heading, as ``summary.json`` has it."""
@@ -57,17 +53,9 @@ class HeadingCorrection:
     def interpolate(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the corrections (n, k) [rad] and the variances (n, k) [rad²] of segments' headings at times [s]."""
         variances = np.diagonal(self.segment_covariance, axis1=1, axis2=2)
-        corrections, known = (
-            np.column_stack([np.interp(time, self.time, values) for values in at_knots.T])
-            for at_knots in (self.errors, variances)
-        )
-        return corrections, known
-
-    def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
-        """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
-        i, j = self.segments.index(near), self.segments.index(far)
-        variance = self.covariance[:, i, i] + self.covariance[:, j, j] - 2.0 * self.covariance[:, i, j]
-        return np.asarray(np.sqrt(np.interp(time, self.time, variance)))
+        knots = np.hstack([self.errors, variances])
+        at_times = np.column_stack([np.interp(time, self.time, values) for values in knots.T])
+        return at_times[:, : variances.shape[1]], at_times[:, variances.shape[1] :]
 
     def correlate_segments(
         self, time: np.ndarray, segment_cov: Mapping[str, np.ndarray]
@@ -77,7 +65,7 @@ class HeadingCorrection:
         Neighbours share what one tells of the other. Where `segment_cov` (n, 3, 3) [rad²] in W, given for each segment,
         states less than the heading filter knew, the correlation stays and the covariance shrinks.
         """
-        rows, scale = {name: i for i, name in enumerate(self.segments) if name in segment_cov}, {}
+        rows, scale = {name: i for i, name in enumerate(self.filter.names) if name in segment_cov}, {}
         if not len(self.time):
             return {}
         for name, i in rows.items():

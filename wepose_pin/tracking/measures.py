@@ -50,8 +50,8 @@ def compute_heading_stds(tracked: TrackResult) -> tuple[dict[str, np.ndarray], d
         if orientation is None or orientation.attitude_cov is None:
             continue
         drift = np.sqrt(np.maximum(compute_heading_variance(orientation.quat_VS, orientation.attitude_cov), 0.0))
-        if correction is not None and len(correction.time) and name in correction.segments:
-            i = correction.segments.index(name)
+        if correction is not None and len(correction.time) and name in correction.filter.names:
+            i = correction.filter.names.index(name)
             drift = np.minimum(drift, np.sqrt(np.interp(tracked.time, correction.time, correction.covariance[:, i, i])))
         stds[name], drifts[name] = np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift
     return stds, drifts

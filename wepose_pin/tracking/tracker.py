@@ -6,6 +6,7 @@ bit-identical quaternions.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -211,8 +212,8 @@ class Tracker:
         # (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
         self._heading_offset = np.array([offsets[name] for name in self.names])
         self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
-        self._recent = np.empty((0, k, 4))  # orientations of the last `RESET_S`
-        self._oldest = 0  # row of `_recent` with the oldest sample
+        # `quat_VS` (k, 4) of the last `RESET_S`
+        self._recent = deque[np.ndarray](maxlen=max(1, round(RESET_S * first.rate_hz)))
         self.quat_WL = np.zeros((k, 4))
         # [rad²] `HeadingCorrector.variance` at the last step; NaN: the heading's variance is that of its filter
         self._variance = np.full((3, k), np.nan)
@@ -244,9 +245,8 @@ class Tracker:
             begin = self._observe_headings(chunk, orientation, states)
         quat_WL, offset = np.empty(quat_VS.shape), np.empty(quat_VS.shape[:2])
         variance = np.empty((*offset.shape, 3))
-        size = max(1, round(RESET_S * self._rate_hz))
-        history = np.concatenate([self._order_recent(), quat_VS])
-        before = len(history) - n
+        before, size = len(self._recent), self._recent.maxlen or 1
+        history = np.concatenate([np.reshape(self._recent, (-1, *quat_VS.shape[1:])), quat_VS])
         accel_S = np.stack([_find_specific_force(sensor) for sensor in chunk.sensors.values()], axis=1)
         clasped = np.zeros(n, dtype=bool)
         for interval in chunk.phases.get(CLASP, ()):
@@ -268,7 +268,7 @@ class Tracker:
                     if self._causal:
                         self._variance = headings.variance
                 first = stop
-        self._recent, self._oldest = history[-size:], 0
+        self._recent.extend(history[-size:].copy())
         # What the filters know after the last chunk, when it ended, and whether the palms were joined.
         self._filter_headings = _describe_headings(*states)
         self._end_s, self._clasped = float(chunk.time[-1]), bool(clasped[-1])
@@ -303,7 +303,7 @@ class Tracker:
                 continue
             quat_VS[:, i] = sensor.quat_VS
             if self._causal and sensor.gap is not None and sensor.gap.any():
-                before = self._recent[self._oldest - 1, i] if len(self._recent) else sensor.quat_VS[0]
+                before = self._recent[-1][i] if self._recent else sensor.quat_VS[0]
                 known = np.concatenate([[True], ~sensor.gap])
                 last = np.maximum.accumulate(np.where(known, np.arange(n + 1), 0))
                 quat_VS[:, i] = np.concatenate([before[None], sensor.quat_VS])[last][1:]
@@ -379,22 +379,22 @@ class Tracker:
         Of a sensor with measured orientations they hold what `pack_orientations` gives. The orientations are without
         the correction by soft tissue and by the body's joints.
         """
-        row = self._recent[self._oldest]
+        quat_VS = np.empty(self.quat_WL.shape)
         if self._measured.any():
-            quat_VS = unpack_orientations(gyro_S, accel_S)
-            lost = ~np.isfinite(quat_VS).all(axis=1)
+            measured = unpack_orientations(gyro_S, accel_S)
+            lost = ~np.isfinite(measured).all(axis=1)
             self._lost = np.where(lost & self._measured, self._lost + 1, 0)
-            row[:] = np.where(lost[:, None], self._recent[self._oldest - 1], quat_VS)
+            quat_VS[:] = np.where(lost[:, None], self._recent[-1], measured)
             if not self._measured.all():
-                row[~self._measured] = self._filters.step(gyro_S[~self._measured], accel_S[~self._measured])
+                quat_VS[~self._measured] = self._filters.step(gyro_S[~self._measured], accel_S[~self._measured])
             accel_S = np.where((self._measured & ~lost)[:, None], 0.0, accel_S)
         else:
-            row[:] = self._filters.step(gyro_S, accel_S)
-        self._place_samples(row[None], self.quat_WL[None])
-        self._oldest = (self._oldest + 1) % len(self._recent)
+            quat_VS[:] = self._filters.step(gyro_S, accel_S)
+        self._recent.append(quat_VS)
+        self._place_samples(quat_VS[None], self.quat_WL[None])
         if self._headings is not None:
             self._variance = self._headings.variance  # of this sample, as in `_place`
-            if self._headings.push(row[None], accel_S[None], self._clasped):
+            if self._headings.push(quat_VS[None], accel_S[None], self._clasped):
                 self._headings.close(_describe_headings(*self._read_filters()))
         return self.quat_WL
 
@@ -412,7 +412,7 @@ class Tracker:
 
     def reset_headings(self) -> None:
         """Reset the headings: the body has stood in the start pose again for `RESET_S`."""
-        self._reset(self._order_recent())
+        self._reset(np.array(self._recent))
 
     @property
     def static(self) -> np.ndarray:
@@ -431,9 +431,8 @@ class Tracker:
 
     def _read_filters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Read what the filters state after the last step, as `_stack` of n = 1 sample."""
-        quat_VS = self._recent[self._oldest - 1].copy()
         attitude_cov = self._extend(self._filters.attitude_cov, np.nan, 3, 3)
-        return quat_VS[None], attitude_cov[None], self._extend(self._filters.about_vertical, np.nan, 3)[None]
+        return self._recent[-1][None], attitude_cov[None], self._extend(self._filters.about_vertical, np.nan, 3)[None]
 
     def _reset(self, recent: np.ndarray) -> None:
         """Reset the headings by recent orientations (m, k, 4)."""
@@ -448,9 +447,6 @@ class Tracker:
         else:
             self._headings.reset(self._heading_offset)
             self._variance = self._headings.variance
-
-    def _order_recent(self) -> np.ndarray:
-        return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
 
 
 def track_chunks(
