@@ -38,13 +38,6 @@ class Sequence(NamedTuple):
     offset: float  # second angle less tip [rad]
 
 
-class Angles3(NamedTuple):
-    """A rotation's angles, each in its principal range."""
-
-    values: np.ndarray  # (n, 3) [rad]
-    gimbal: np.ndarray  # (n,) [rad], from the lock
-
-
 def sequence(name: str) -> Sequence:
     """Read a sequence of three letters X, Y, Z, neighbours different."""
     i, j, last = ("XYZ".index(letter) for letter in name)
@@ -53,8 +46,10 @@ def sequence(name: str) -> Sequence:
     return Sequence(i, j, k, eps, 0.0 if last == i else eps * np.pi / 2.0)
 
 
-def decompose(quat: np.ndarray, name: str) -> Angles3:
-    """Take rotations (n, 4) apart: first and third in (−π, π], second in [−π, 0] or, of three axes, [−π/2, π/2].
+def decompose(quat: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Take rotations (n, 4) apart: return their angles (n, 3) and how far they are from gimbal lock (n,) [rad].
+
+    First and third are in (−π, π], the second in [−π, 0] or, of three axes, [−π/2, π/2].
 
     A proper sequence's second angle is negative, as the ISB has the elevation of the arm. In the lock, where only the
     sum or the difference of first and third is defined, the first is held from the sample before (at the beginning,
@@ -78,7 +73,7 @@ def decompose(quat: np.ndarray, name: str) -> Angles3:
     if not s.offset or s.eps > 0.0:  # the other of the two solutions is the one in the principal range
         first, tip, third = first + np.pi, -tip, third + np.pi
     gimbal = 2.0 * np.arctan2(np.minimum(cosine, sine), np.maximum(cosine, sine))
-    return Angles3(np.column_stack([wrap(first), tip + s.offset, wrap(third)]), gimbal)
+    return np.column_stack([wrap(first), tip + s.offset, wrap(third)]), gimbal
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
@@ -101,8 +96,8 @@ def count_turns(angles: np.ndarray) -> np.ndarray:
     return round_to_turns(np.where(known, angles - wrap(np.nan_to_num(first)), 0.0))
 
 
-def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
-    """Follow the angles (n, 3) over time, unwrapped: of both solutions of a sample the one that continues the last.
+def follow(angles: tuple[np.ndarray, np.ndarray], name: str, near_lock: float) -> np.ndarray:
+    """Follow the angles of `decompose` over time (n, 3), unwrapped: the solutions that continue each other.
 
     A motion that goes straight through the lock keeps its first and third angle, and the second goes on beyond its
     principal range. What the motion does within `near_lock` [rad] of the lock does not count, only how it came and how

@@ -241,8 +241,8 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
     quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
     quat = multiply(conjugate(quat_WP), quat_WD)
-    angles = euler.decompose(quat, joint.sequence)
-    values = euler.follow(angles, joint.sequence, NEAR_LOCK)
+    principal, gimbal = euler.decompose(quat, joint.sequence)
+    values = euler.follow((principal, gimbal), joint.sequence, NEAR_LOCK)
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
@@ -250,7 +250,7 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
-    gimbal, values, quat = (_expand(known, each) for each in (angles.gimbal, values, rotations.unwrap_signs(quat)))
+    gimbal, values, quat = (_expand(known, each) for each in (gimbal, values, rotations.unwrap_signs(quat)))
     std = None if std is None else _expand(known, std)
     return JointAngles(joint.sequence, joint.names, values, gimbal, gimbal < NEAR_LOCK, gap, std, quat)
 

@@ -31,17 +31,6 @@ _SHORTEST_RUN = 10  # samples; a shorter run is not filtered
 
 
 @dataclass(frozen=True)
-class MovementOptions:
-    """How the angles of a session are made and its repetitions found."""
-
-    sequence: str = AUTO  # of the shoulder, one of `SHOULDER_SEQUENCES`, or `AUTO`
-    cutoff_hz: float | None = None  # of the low-pass (`smooth_pose`); None: none
-    phase: str | None = None  # takes each of its intervals as a repetition; None: repetitions are found
-    main_angle: str | None = None  # these two: of `find_repetitions`
-    rising: bool | None = None
-
-
-@dataclass(frozen=True)
 class Movement:
     """The angles of a session, or of the selected time of it."""
 
@@ -59,28 +48,40 @@ class Movement:
         return next((each.sequence for name, each in self.angles.joints.items() if not JOINTS[name].sequence), "")
 
 
-def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], options: MovementOptions) -> Movement:
+def analyze_movement(
+    name: str,
+    pose: Pose,
+    phases: Mapping[str, Intervals],
+    *,
+    sequence: str = AUTO,
+    cutoff_hz: float | None = None,
+    phase: str | None = None,
+    main_angle: str | None = None,
+    rising: bool | None = None,
+) -> Movement:
     """Compute the angles of a session, find its repetitions and measure them.
 
-    `WeposeError`: no joint has both of its segments; there is no such angle or phase; a cut-off that is not possible.
+    The shoulder's angles are of `sequence`, as in `joint_angles`, and low-passed at `cutoff_hz` (`smooth_pose`; None:
+    not). Each interval of `phase` is a repetition; None: they are found by `main_angle` and `rising`, as in
+    `find_repetitions`. `WeposeError`: no joint has both of its segments; there is no such angle or phase; a cut-off
+    that is not possible.
     """
-    if options.cutoff_hz is not None:
-        pose = smooth_pose(pose, options.cutoff_hz)
-    angles = joint_angles(pose, options.sequence)
+    if cutoff_hz is not None:
+        pose = smooth_pose(pose, cutoff_hz)
+    angles = joint_angles(pose, sequence)
     step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 0.0
     begin, end = pose.time[0] - step, pose.time[-1] + step
-    inside = {phase: tuple((a, b) for a, b in spans if a > begin and b < end) for phase, spans in phases.items()}
-    marked = options.phase
-    if marked is None:
-        repetitions = find_repetitions(angles, options.main_angle, options.rising)
-    elif phases.get(marked):
-        reason = "" if inside[marked] else f"no interval of the phase {marked} lies in the selected time"
-        repetitions = Repetitions(np.array(inside[marked], dtype=float).reshape(-1, 2), marked, reason=reason)
+    inside = {each: tuple((a, b) for a, b in spans if a > begin and b < end) for each, spans in phases.items()}
+    if phase is None:
+        repetitions = find_repetitions(angles, main_angle, rising)
+    elif phases.get(phase):
+        reason = "" if inside[phase] else f"no interval of the phase {phase} lies in the selected time"
+        repetitions = Repetitions(np.array(inside[phase], dtype=float).reshape(-1, 2), phase, reason=reason)
     else:
-        choices = one_of(phases, marked) if phases else "it has no phases; without --repetitions they are found"
-        raise WrongOption("repetitions", marked, f"the recording has no such phase; {choices}")
+        choices = one_of(phases, phase) if phases else "it has no phases; without --repetitions they are found"
+        raise WrongOption("repetitions", phase, f"the recording has no such phase; {choices}")
     curves = compute_mean_curves(angles, repetitions.spans) if len(repetitions.spans) else {}
-    return Movement(name, pose, angles, inside, repetitions, curves, options.cutoff_hz)
+    return Movement(name, pose, angles, inside, repetitions, curves, cutoff_hz)
 
 
 def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:

@@ -59,8 +59,6 @@ def angles(
         for more than 1 % of the time, the one that is so least.
     """
     options = dict(locals())
-    from dataclasses import replace
-
     from polars import selectors
 
     from ..angles import diagnose_lock
@@ -76,7 +74,7 @@ def angles(
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
             # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
-            chosen = build.MovementOptions(shoulder, low_pass_hz, repetitions, main_angle)
+            sequence, source, rising = str(shoulder), main_angle, None
             movements: list[Movement] = []
             for k, each in enumerate((result, *further), 1):
                 progress("reading", 0.7 * (k - 1) / (1 + len(further)))
@@ -84,14 +82,22 @@ def angles(
                 pose, name = select_pose(tracked, interval, phase), tracked.name
                 name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
                 try:
-                    movement = build.analyze_movement(name, pose, tracked.phases, chosen)
+                    movement = build.analyze_movement(
+                        name,
+                        pose,
+                        tracked.phases,
+                        sequence=sequence,
+                        cutoff_hz=low_pass_hz,
+                        phase=repetitions,
+                        main_angle=source,
+                        rising=rising,
+                    )
                 except WrongOption as error:
                     raise BadOption(f"{each}: {error}" if further else str(error)) from None
                 movements.append(movement)
-                chosen = replace(chosen, sequence=movement.sequence or chosen.sequence)
+                sequence = movement.sequence or sequence
                 if repetitions is None and len(movement.repetitions.spans):
                     source, rising = movement.repetitions.source, movement.repetitions.rising
-                    chosen = replace(chosen, main_angle=source, rising=rising)
             progress("writing", 0.7)
             tables = build.build_tables(movements)
             for name, table in tables.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import NamedTuple
 
@@ -215,15 +215,9 @@ def _resample(truth: Pose, time: np.ndarray) -> Pose:
 
 def _joint_errors(pose: Pose, truth: Pose, segments: list[str]) -> dict[str, dict[str, AngleError]]:
     """Joint → angle → its error, of joints between these segments."""
-    poses = [
-        Pose(
-            each.time,
-            {name: each.quat_WL[name] for name in segments},
-            {},
-            gap={name: each.gap[name] for name in segments if name in each.gap},
-        )
-        for each in (pose, truth)
-    ]
+    poses = (
+        replace(each, quat_WL={name: each.quat_WL[name] for name in segments}, segment_cov={}) for each in (pose, truth)
+    )
     try:
         angles, true = map(joint_angles, poses)
     except BadData:  # no joint has both of its segments
@@ -233,7 +227,7 @@ def _joint_errors(pose: Pose, truth: Pose, segments: list[str]) -> dict[str, dic
         sound = ~(joint.gap | joint.near_lock | true[name].gap | true[name].near_lock)
         if sound.any():
             # Principal values: two sets of angles that differ by half turns are the same pose.
-            values = [euler.decompose(each.quat[sound], joint.sequence).values for each in (joint, true[name])]
+            values = [euler.decompose(each.quat[sound], joint.sequence)[0] for each in (joint, true[name])]
             error, measured = np.degrees(euler.wrap(values[0] - values[1])), np.degrees(values[1])
             errors[name] = {
                 angle: angle_error(measured[:, k] + error[:, k], measured[:, k]) for k, angle in enumerate(joint.names)

@@ -13,6 +13,7 @@ from ..body.links import compute_axis_std
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (
+    compute_heading_stds,
     compute_joint_heading_stds,
     find_samples_after_start,
     finite_max,
@@ -74,7 +75,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
         ],
         {
             "What was recorded": _list_recorded(tracked, measures),
-            "Drift of the headings": _list_drift(tracked, measures.heading_stds[0]),
+            "Drift of the headings": _list_drift(tracked),
             f"The {_name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
             "The motion in 3D": [frame],
@@ -172,7 +173,8 @@ def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     ]
 
 
-def _list_drift(tracked: TrackResult, stds: Mapping[str, np.ndarray]) -> list[Item]:
+def _list_drift(tracked: TrackResult) -> list[Item]:
+    stds, _ = compute_heading_stds(tracked)
     if not stds:
         return [_explain_no_covariance(tracked)]
     table, after_start = tracked.model.table, find_samples_after_start(tracked)

@@ -12,9 +12,8 @@ import numpy as np
 import polars as pl
 
 from ..body import BodyModel
-from ..body.configuration import compute_orientation_residuals, solve_configuration
+from ..body.configuration import solve_configuration
 from ..body.kinematics import Pose, build_pose_table
-from ..body.links import find_undetermined_joints
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic, notebook_html
 from ..errors import BadData, Named, WeposeError, how_to_install
@@ -105,16 +104,6 @@ class TrackResult:
     def check(self) -> TrackResult:
         self.pose.check()
         return self
-
-    def compute_orientation_residuals(self) -> dict[str, np.ndarray]:
-        """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""
-        return compute_orientation_residuals(self.model, self.q, self.segments.quat_WL)
-
-    def find_undetermined_joints(self) -> list[str]:
-        """Find the joints of a mechanism that the measured segments leave open, at least in part: they move little."""
-        if not self.model.table.is_mechanism:
-            return []
-        return find_undetermined_joints(self.model, self.quat_WL)
 
     def to_dataframe(self) -> pl.DataFrame:
         """Return the table of ``pose.parquet``, a row a sample, as polars has it.

@@ -114,7 +114,8 @@ def split_start_pose(received: Recording) -> tuple[Recording, Recording] | None:
     else:
         measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
         detector = StartPoseDetector(received.rate_hz, np.array(measured))
-        if detector.push(*stack_ticks(received)) is None:
+        numbers = zip(*map(list_numbers, received.sensors.values()), strict=True)
+        if detector.push(*(np.stack(columns, axis=1) for columns in numbers)) is None:
             return None
         interval = float(received.time[detector.begin]), float(received.time[detector.end])
     span, before = received.span(interval), dict[str, Intervals](start=(interval,))
@@ -124,10 +125,3 @@ def split_start_pose(received: Recording) -> tuple[Recording, Recording] | None:
         begin = min(begin, received.span(static[0]).start)
     start = replace(received.cut(slice(begin, span.stop)), phases=before, start_is_guessed=not is_stated)
     return start, received.cut(slice(span.stop, len(received)))
-
-
-def stack_ticks(chunk: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Stack the six numbers of all sensors as ticks have them, (n, k, 3) each, orientations packed; bridged in gaps."""
-    numbers = [list_numbers(sensor) for sensor in chunk.sensors.values()]
-    gyro_S, accel_S = (np.stack(column, axis=1) for column in zip(*numbers, strict=True))
-    return gyro_S, accel_S

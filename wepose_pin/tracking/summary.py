@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..body.configuration import compute_orientation_residuals
 from ..body.kinematics import Pose, join_poses
+from ..body.links import find_undetermined_joints
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, drop_consequences, gravest_first, merge
 from ..filters import STATIC_ONLY, Orientation, join_orientations
 from ..recording import Recording
@@ -72,11 +74,10 @@ class TrackSummary:
     def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
         """Iterate over chunks, and add each."""
         for chunk in chunks:
-            self.add(chunk)
+            self._add(chunk)
             yield chunk
 
-    def add(self, tracked: TrackResult) -> None:
-        """Add the next chunk."""
+    def _add(self, tracked: TrackResult) -> None:
         rows = slice(-self._samples % self._every, None, self._every)
         self._poses.append(tracked.pose.cut(rows))
         for segment, orientation in tracked.segments.orientation.items():
@@ -87,7 +88,8 @@ class TrackSummary:
             pose = join_poses([self.last.pose.cut(slice(-max(1, round(PEAK_OVER_S * rate_hz)), None)), pose])
         for name, reach in measure_reach(pose, tracked.model.table).items():
             self.peak_speed[name] = max(self.peak_speed.get(name, 0.0), compute_peak_speed(reach, rate_hz))
-        for segment, angle in tracked.compute_orientation_residuals().items():
+        residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.segments.quat_WL)
+        for segment, angle in residuals.items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
         for name, values in tracked.joints.items() if tracked.model.table.is_mechanism else ():
             least, most = self._joints.get(name, (np.inf, -np.inf))
@@ -118,9 +120,10 @@ class TrackSummary:
         return {name: measure_signal(self.recording, name) for name in self.recording.sensors}
 
     @cached_property
-    def heading_stds(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Standard deviations of headings and of their drifts, as `compute_heading_stds`."""
-        return compute_heading_stds(self.tracked)
+    def undetermined_joints(self) -> list[str]:
+        """The joints of a mechanism that the measured segments leave open, at least in part: they move little."""
+        model = self.last.model
+        return find_undetermined_joints(model, self.last.quat_WL) if model.table.is_mechanism else []
 
     @cached_property
     def error_budget(self) -> dict[str, dict[str, float]]:
@@ -179,7 +182,7 @@ class TrackSummary:
             content |= {
                 "start_joints": dict(table.poses.get(recording.start_pose, recording.joints)),  # others are at zero
                 "joints": {name: {"min": round(a, 5), "max": round(b, 5)} for name, (a, b) in self._joints.items()},
-                "undetermined_joints": last.find_undetermined_joints(),
+                "undetermined_joints": self.undetermined_joints,
             }
         return content | {
             "heading_correction": None if correction is None else correction.summarize(),
@@ -200,8 +203,8 @@ class TrackSummary:
         if missing and lacking:
             facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
             yield Diagnostic("sensors-missing", INFO, facts=facts)
-        if joints := last.find_undetermined_joints():
-            facts = {"variant": "joints", "joints": ", ".join(joints)}
+        if self.undetermined_joints:
+            facts = {"variant": "joints", "joints": ", ".join(self.undetermined_joints)}
             yield Diagnostic("sensors-missing", WARNING, facts=facts)
         for segment, rms in self.residual_rms.items():
             if rms > MOST_RESIDUAL:
@@ -231,7 +234,7 @@ class TrackSummary:
 
     def _diagnose_headings(self) -> Iterator[Diagnostic]:
         since, correction = find_samples_after_start(self.tracked), self.last.correction
-        joints = compute_joint_heading_stds(self.heading_stds[1], self.last.model)
+        joints = compute_joint_heading_stds(compute_heading_stds(self.tracked)[1], self.last.model)
         wide = {joint: most for joint, std in joints.items() if (most := finite_max(std[since])) > HEADING}
         for joint in sorted(wide, key=wide.__getitem__, reverse=True):
             yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING)
@@ -264,5 +267,5 @@ class TrackSummary:
 def summarize(tracked: TrackResult) -> TrackSummary:
     """Return the summary of a recording that was tracked as a whole."""
     summary = TrackSummary(tracked.recording)
-    summary.add(tracked)
+    list(summary.accumulate([tracked]))
     return summary
