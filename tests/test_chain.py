@@ -71,30 +71,26 @@ def made(urdf: Path, links: list[str], seconds: float = 30.0) -> tuple[Recording
     return Recording("made", t, RATE, sensors, phases=phases, start_pose="configuration", joints=UPRIGHT), q
 
 
-def rms_deg(angle: np.ndarray) -> float:
-    return float(np.degrees(np.sqrt(np.mean(angle**2))))
-
-
 def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
     recording, q = made(urdf, ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"])
     tracked = track(recording, model=urdf)
-    assert tracked.find_undetermined_joints() == []
+    assert tracked.summary["undetermined_joints"] == []
     assert list(tracked.joints) == list(UR5)
     for k, value in enumerate(tracked.joints.values()):
         assert np.abs(value - q[:, k]).max() < np.deg2rad(1.0)
     for name, span in tracked.summary["joints"].items():
         ends = tracked.joints[name].min(), tracked.joints[name].max()
         assert (span["min"], span["max"]) == pytest.approx(ends, abs=1e-5)
-    residual = tracked.compute_orientation_residuals()
-    assert set(residual) == set(recording.sensors)
-    assert max(rms_deg(angle) for angle in residual.values()) < 0.5
+    residual_deg = tracked.summary["orientation_residual_rms_deg"]
+    assert set(residual_deg) == set(recording.sensors)
+    assert max(residual_deg.values()) < 0.5
 
 
 def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) -> None:
     recording, q = made(urdf, ["forearm_link"])
     tracked = track(recording, model=urdf)
     undetermined = {"shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"}
-    assert set(tracked.find_undetermined_joints()) == undetermined
+    assert set(tracked.summary["undetermined_joints"]) == undetermined
     joints = tracked.joints
     np.testing.assert_allclose(joints["shoulder_pan_joint"], q[:, 0], atol=np.deg2rad(1.0))
     both = joints["shoulder_lift_joint"] + joints["elbow_joint"]
