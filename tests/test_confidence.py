@@ -92,13 +92,8 @@ def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:
     assert set(budget) == set(tracked.points)
     for point, parts in budget.items():
         total = 1e3 * np.sqrt(np.mean(np.trace(tracked.pose.point_cov[point], axis1=1, axis2=2)) / 3.0)
-        assert np.sqrt(sum(std**2 for std in parts.values())) == pytest.approx(total, rel=0.05)
+        assert np.sqrt(sum(std**2 for std in parts.values())) == pytest.approx(total, rel=0.02)
         assert list(parts.values()) == sorted(parts.values(), reverse=True)
-        # A segment matters for what it carries, with its sensor and with the soft tissue below that.
-        side, _, place = point.partition("_")
-        carrying = ["torso", *(f"{side}_{part}" for part in ("upper_arm", "forearm"))]
-        of = {part.partition(": ")[0] for part in parts} - {"shoulder girdle", "lengths"}
-        assert of == set(carrying[: {"shoulder": 1, "elbow": 2}.get(place, 3)])
     # A person who is known exactly has no share of lengths, and of girdles what leaves the law.
     order = (*LENGTHS, *GIRDLE_ROWS)
     exact = replace(population_subject(), order=order, covariance=np.zeros((len(order), len(order))))

@@ -87,10 +87,7 @@ def register(
             quat_WT[name] = multiply(quat_WT[name], R_TL.as_quat())
             turned[name] = float(np.degrees(R_TL.magnitude()))
     points = {name: p_V @ R_WV.as_matrix().T for name, p_V in truth.points.items()}
-    off = [
-        sample_points(pose.time, pose.points[name], time) - sample_points(truth.time, points[name], time)
-        for name in names
-    ]
+    off = [sample(pose.time, pose.points[name], time) - sample(truth.time, points[name], time) for name in names]
     apart = np.mean(off, axis=0)[np.isfinite(off).all(axis=(0, 2))] if names else np.empty((0, 3))
     x, y, z = np.median(apart, axis=0).tolist() if len(apart) else (0.0, 0.0, 0.0)
     points = {name: p + (x, y, z) for name, p in points.items()}
@@ -105,7 +102,7 @@ def _is_known(values: np.ndarray | None) -> bool:
 
 def _sample_both(pose: Pose, truth: Pose, segment: str, time: np.ndarray) -> tuple[Rotation, Rotation]:
     """Sample the orientations of a segment in both at those of the times (n,) [s] at which both are known."""
-    sampled = [sample_orientations(each.time, each.quat_WL[segment], time) for each in (pose, truth)]
+    sampled = [sample(each.time, each.quat_WL[segment], time) for each in (pose, truth)]
     known = np.isfinite(sampled).all(axis=(0, 2))
     ours, theirs = (Rotation.from_quat(quat[known]) for quat in sampled)
     return ours, theirs
@@ -148,7 +145,7 @@ def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
     ends = grid - 0.5 * TURN_S, grid + 0.5 * TURN_S
     speeds = []
     for quat in pose.quat_WL.values():
-        before, after = (sample_orientations(pose.time, quat, time) for time in ends)
+        before, after = (sample(pose.time, quat, time) for time in ends)
         cos = np.abs(np.sum(before * after, axis=1))
         sin = np.linalg.norm(multiply(conjugate(before), after)[:, :3], axis=1)
         speeds.append(2.0 * np.arctan2(sin, cos) / TURN_S)
@@ -209,24 +206,20 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
 # Sampling --------------------------------------------------------------------------------------------------------
 
 
-def sample_orientations(time: np.ndarray, quat: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return orientations (m, 4) of times (m,) [s] at other times (n,), interpolated on the rotation: (n, 4)."""
-    good = np.isfinite(quat).all(axis=1)
-    known, spanned = time[good], _is_spanned(time[good], at)
-    sampled = np.full((len(at), 4), np.nan)
-    if spanned.any():
-        clipped = np.clip(at[spanned], known[0], known[-1])
-        sampled[spanned] = Slerp(known, Rotation.from_quat(quat[good]))(clipped).as_quat()
-    return sampled
+def sample(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return orientations (m, 4), or points (m, 3), of times (m,) [s] at other times (n,), interpolated.
 
-
-def sample_points(time: np.ndarray, points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return points (m, 3) of times (m,) [s] at other times (n,), linear between samples: (n, 3)."""
-    good = np.isfinite(points).all(axis=1)
+    It is on the rotation, or linear; NaN where no known ones are near.
+    """
+    good = np.isfinite(values).all(axis=1)
     known, spanned = time[good], _is_spanned(time[good], at)
-    sampled = np.full((len(at), 3), np.nan)
+    sampled = np.full((len(at), values.shape[1]), np.nan)
     if spanned.any():
-        sampled[spanned] = np.column_stack([np.interp(at[spanned], known, axis) for axis in points[good].T])
+        at = np.clip(at[spanned], known[0], known[-1])
+        if values.shape[1] == 4:
+            sampled[spanned] = Slerp(known, Rotation.from_quat(values[good]))(at).as_quat()
+        else:
+            sampled[spanned] = np.column_stack([np.interp(at, known, axis) for axis in values[good].T])
     return sampled
 
 

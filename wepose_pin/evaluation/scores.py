@@ -18,7 +18,7 @@ from ..diagnostics import notebook_html
 from ..errors import BadData, BadOption
 from ..recording import format_span
 from ..tracking import TrackResult
-from .registration import Registration, sample_orientations, sample_points
+from .registration import Registration, sample
 
 LIMITS = 1.96  # standard deviations of the differences, in which 95 % of them are where they are normal
 SINGULAR = 1e-12  # ratio of a covariance's least variance to its largest, below which it states no error in a direction
@@ -164,7 +164,12 @@ def evaluate(
             + (f" within the interval {format_span(interval)}" if interval else "")
         )
     pose = pose.cut(inside)
-    truth = _resample(truth, np.clip(pose.time, truth.time[0], truth.time[-1]))
+    time = np.clip(pose.time, truth.time[0], truth.time[-1])
+    truth = Pose(
+        time,
+        {name: sample(truth.time, quat, time) for name, quat in truth.quat_WL.items()},
+        {name: sample(truth.time, points, time) for name, points in truth.points.items()},
+    )
     attitude, attitude_uncertainty = {}, {}
     for segment in [segment for segment in pose.quat_WL if segment in truth.quat_WL]:
         quats = pose.quat_WL[segment], truth.quat_WL[segment]
@@ -205,12 +210,6 @@ def evaluate(
     uncertainties = attitude_uncertainty, position_uncertainty
     span = float(truth.time[0]), float(truth.time[-1])
     return Evaluation(attitude, joints, position, position_on_limb, *uncertainties, span, len(pose.time))
-
-
-def _resample(truth: Pose, time: np.ndarray) -> Pose:
-    """The reference at other times (n,) [s], without covariances; NaN where it is not known."""
-    quat_WL = {name: sample_orientations(truth.time, quat, time) for name, quat in truth.quat_WL.items()}
-    return Pose(time, quat_WL, {name: sample_points(truth.time, p, time) for name, p in truth.points.items()})
 
 
 def _joint_errors(pose: Pose, truth: Pose, segments: list[str]) -> dict[str, dict[str, AngleError]]:

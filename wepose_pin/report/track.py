@@ -13,12 +13,12 @@ from ..body.links import compute_axis_std
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (
+    SOURCES,
     compute_heading_stds,
     compute_joint_heading_stds,
     find_samples_after_start,
     finite_max,
     finite_median,
-    group_by_source,
     has_stated_mounts,
     longest_run_s,
     measure_reach,
@@ -227,10 +227,12 @@ def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
 
 def tabulate_error_budget(budget: Mapping[str, Mapping[str, float]]) -> list[Table]:
     """The share of each source of error in the ± of each point; none where no ± is known."""
-    sources = {point: group_by_source(parts) for point, parts in budget.items()}
-    rows = [[plain(point), *(number(1e3 * std, 0) for std in each.values())] for point, each in sources.items()]
+    rows = []
+    for point, shares in budget.items():
+        stds = *(shares.get(source, 0.0) for source in SOURCES), float(np.linalg.norm([*shares.values()]))
+        rows.append([plain(point), *(number(1e3 * std, 0) for std in stds)])
     title = "What the ± is made of: root mean square of an axis; the parts add up in squares"
-    return [Table(title, ["", *(f"{source} [mm]" for source in next(iter(sources.values())))], rows)] if rows else []
+    return [Table(title, ["", *(f"{source} [mm]" for source in (*SOURCES, "all"))], rows)] if rows else []
 
 
 def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:

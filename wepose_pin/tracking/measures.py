@@ -1,8 +1,8 @@
 """Measures of a tracked recording: the sensors' signals, headings, hinges, tips of limbs, and the error budget.
 
 The error budget is the contribution of each source of error to the standard deviation of each point. The contributions
-add up in variance. They are independent of one another but for lengths and girdles, whose correlation goes to the
-lengths, and the headings of segments, whose correlations go to the parts of the sensors, in proportion to these.
+add up in variance. The correlation of lengths and girdles goes to the lengths, that of the segments' headings to the
+sensors.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .segment_orientations import compute_heading_variance, compute_soft_tissue_
 
 PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
 PERIOD_S = 1.0  # [s] from one sample of the error budget to the next
-SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"
+SOURCES = ("soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle")  # of the error budget
 
 
 def measure_signal(recording: Recording, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -132,8 +132,7 @@ def find_samples_after_start(tracked: TrackResult) -> np.ndarray:
 def compute_error_budget(tracked: TrackResult) -> dict[str, dict[str, float]]:
     """Point → source of error → its share of the standard deviation [m] per axis, rms over time; the largest first.
 
-    Soft tissue and sensor are of each segment, as "torso: soft tissue". Parts below a tenth of a millimetre are left
-    out. It is empty of a mechanism, and where no covariance is known.
+    Shares below a tenth of a millimetre are left out. It is empty of a mechanism, and where no covariance is known.
     """
     pose, body = tracked.pose, tracked.model
     rows = np.arange(0, len(tracked.time), max(1, round(PERIOD_S * tracked.rate_hz)) if len(tracked.time) > 1 else 1)
@@ -142,48 +141,24 @@ def compute_error_budget(tracked: TrackResult) -> dict[str, dict[str, float]]:
     if body.table.is_mechanism or not pose.point_cov or not len(rows):
         return {}
     quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}
-    total = {name: cov[rows] for name, cov in pose.segment_cov.items()}
-    zero = {name: np.zeros_like(cov) for name, cov in total.items()}
+    soft = {name: compute_soft_tissue_covariance(body.personal_table, quat_WL, name) for name in pose.segment_cov}
+    zero = {name: np.zeros_like(cov) for name, cov in soft.items()}
     shape_cov = tracked.subject.shape_covariance(body.table)
     of_girdles, none, k = shape_cov.copy(), 0.0 * shape_cov, len(body.lengths)
     of_girdles[:k], of_girdles[:, :k] = 0.0, 0.0
-
-    def compute_variances(segment_cov: Mapping[str, np.ndarray], shape: np.ndarray) -> dict[str, float]:
-        covs = compute_point_covariances(body, quat_WL, segment_cov, shape)
-        return {point: _mean_variance(cov) for point, cov in covs.items()}
-
-    exact = compute_variances(zero, none)  # what leaves the law of the girdles
-    with_girdles, with_lengths = compute_variances(zero, of_girdles), compute_variances(zero, shape_cov)
-    independent = compute_variances(total, shape_cov)
-    table = body.personal_table
-    parts = {point: {GIRDLES: value, LENGTHS: with_lengths[point] - value} for point, value in with_girdles.items()}
-    for name in total:
-        own_soft = compute_variances({**zero, name: compute_soft_tissue_covariance(table, quat_WL, name)}, none)
-        both = compute_variances({**zero, name: total[name]}, none)
-        for point, own in parts.items():
-            own[f"{name}: {SOFT_TISSUE}"] = own_soft[point] - exact[point]
-            own[f"{name}: {SENSOR}"] = both[point] - own_soft[point]
+    cases = (zero, none), (zero, of_girdles), (zero, shape_cov), (soft, none)
+    covs = [compute_point_covariances(body, quat_WL, *case) for case in cases]
     budget = {}
-    for point, own in parts.items():
-        sensors = sum(value for part, value in own.items() if part.endswith(SENSOR))
-        correlated = _mean_variance(pose.point_cov[point][rows]) - independent[point]
-        ratio = 1.0 + correlated / sensors if sensors else 1.0
-        stds = {part: np.sqrt(max(v * (ratio if part.endswith(SENSOR) else 1.0), 0.0)) for part, v in own.items()}
+    for point, cov in pose.point_cov.items():
+        total, law, girdles, shape, tissue = (
+            float(np.mean(np.trace(each, axis1=1, axis2=2))) / 3.0
+            for each in (cov[rows], *(own[point] for own in covs))
+        )
+        variances = tissue - law, total - shape - tissue + law, shape - girdles, girdles
+        stds = {source: float(np.sqrt(max(value, 0.0))) for source, value in zip(SOURCES, variances, strict=True)}
         ordered = sorted(stds.items(), key=lambda item: -item[1])
-        budget[point] = {part: float(std) for part, std in ordered if std >= 1e-4}
+        budget[point] = {source: std for source, std in ordered if std >= 1e-4}
     return budget
-
-
-def _mean_variance(cov: np.ndarray) -> float:
-    return float(np.mean(np.trace(cov, axis1=1, axis2=2))) / 3.0
-
-
-def group_by_source(parts: Mapping[str, float]) -> dict[str, float]:
-    """Source → its share of a point's standard deviation, of all segments together, and of all sources as "all"."""
-    groups = dict.fromkeys((SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES), 0.0)
-    for part, std in parts.items():
-        groups[part.rpartition(": ")[2]] += std**2
-    return {source: float(np.sqrt(value)) for source, value in {**groups, "all": sum(groups.values())}.items()}
 
 
 def finite_max(values: np.ndarray) -> float:
