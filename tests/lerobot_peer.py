@@ -33,8 +33,6 @@ def read(root: str) -> dict[str, object]:
         "frames": len(data),
         "state": np.stack([frame["observation.state"].numpy() for frame in frames]).tolist(),
         "action": np.stack([frame["action"].numpy() for frame in frames]).tolist(),
-        "timestamp": [float(frame["timestamp"]) for frame in frames],
-        "episode_index": [int(frame["episode_index"]) for frame in frames],
         "tasks": [frame["task"] for frame in frames],
         "mean": data.meta.stats["action"]["mean"].tolist(),
         "ahead": list(batch["action"].shape),

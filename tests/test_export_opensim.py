@@ -20,15 +20,9 @@ from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 from wepose_pin import Pose, export, joint_angles, load_model
 from wepose_pin.body.configuration import compute_pose
 
-SEGMENT_OF = {
-    "pelvis": "pelvis",
-    "torso": "torso",
-    **{
-        f"{body}_{s}": f"{side}_{part}"
-        for s, side in (("r", "right"), ("l", "left"))
-        for body, part in (("humerus", "upper_arm"), ("radius", "forearm"), ("hand", "hand"))
-    },
-}
+BODIES = {"humerus": "upper_arm", "radius": "forearm", "hand": "hand"}
+SEGMENT_OF = {"pelvis": "pelvis", "torso": "torso"}
+SEGMENT_OF |= {f"{body}_{side[0]}": f"{side}_{part}" for side in ("right", "left") for body, part in BODIES.items()}
 # Of each coordinate the middle and the size of a made motion [rad], within what the joint can do.
 MOTION = {
     "pelvis_tilt": (0.0, 0.1), "pelvis_list": (0.0, 0.1), "pelvis_rotation": (0.0, 0.3),
@@ -51,11 +45,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def motion(n: int) -> dict[str, np.ndarray]:
     """Coordinate → (n,) [rad]."""
-    names = [
-        f"{name}{end}"
-        for name in MOTION
-        for end in (("",) if "_" in name and name[:3] in ("pel", "lum") else ("_r", "_l"))
-    ]
+    names = [f"{name}{end}" for name in MOTION for end in ([""] if name[:3] in ("pel", "lum") else ["_r", "_l"])]
     values = {}
     for k, name in enumerate(names):
         middle, size = MOTION[name.removesuffix("_r").removesuffix("_l")]
@@ -73,13 +63,8 @@ def test_mot_keeps_the_rules(result: Path, tmp_path: Path) -> None:
     lines = text.split("\n")
     end = lines.index("endheader")
     assert lines[0] == "a - made² one"  # Storage.cpp: the name; an equals sign would make it a key
-    header = dict(line.split("=") for line in lines[1:end])
-    assert header == {
-        "version": "1",
-        "nRows": "301",
-        "nColumns": str(len(lines[end + 1].split("\t"))),
-        "inDegrees": "yes",
-    }
+    header, columns = dict(line.split("=") for line in lines[1:end]), str(len(lines[end + 1].split("\t")))
+    assert header == {"version": "1", "nRows": "301", "nColumns": columns, "inDegrees": "yes"}
     assert lines[end + 1].split("\t")[0] == "time"
     assert {len(line.split("\t")) for line in lines[end + 1 : -1]} == {int(header["nColumns"])}
     assert (len(lines) - end - 3, lines[-1]) == (301, "")  # an empty line would end the data
@@ -177,10 +162,7 @@ def test_the_scale_tool_is_told_the_subjects_lengths(result: Path, tmp_path: Pat
     assert tool.tag == "ScaleTool"
     assert tool.findtext("GenericModelMaker/model_file") == "Rajagopal_2015.osim"
     assert tool.findtext("ModelScaler/output_model_file") == "anna.osim"
-    scales = {
-        each.findtext("segment"): np.array((each.findtext("scales") or "").split(), dtype=float)
-        for each in tool.iter("Scale")
-    }
+    scales = {each.findtext("segment"): np.fromstring(each.findtext("scales"), sep=" ") for each in tool.iter("Scale")}
     lengths = load_model(lengths=LENGTHS).lengths
     trunk, width = lengths["trunk"] / 0.53309, lengths["shoulder_width"] / 0.34
     np.testing.assert_allclose(scales["torso"], [trunk, trunk, width], rtol=1e-5)
@@ -230,9 +212,8 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
     # The .osim has the axes of the forearm and its right angles to five digits.
     np.testing.assert_allclose(table["values"], wanted, atol=2e-3)
     export(folder, tmp_path / "both.mot")
-    np.testing.assert_allclose(
-        peer("play", tmp_path / "both.mot", table["labels"]), wanted, atol=2e-3
-    )  # columns it has no use for
+    played = peer("play", tmp_path / "both.mot", table["labels"])  # with columns it has no use for
+    np.testing.assert_allclose(played, wanted, atol=2e-3)
     assert peer("read_as_storage", tmp_path / "x.mot") == ("a - made² one", 60, 1 + len(values), True)
 
 
@@ -240,9 +221,8 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
 def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], tmp_path: Path) -> None:
     pose = pose_by_opensim(peer, motion(12), noise=0.15)  # what no elbow of two axes follows
     folder = write_folder(tmp_path / "r", pose)
-    assert "orientation-residual" in {
-        each.code for each in export(folder, tmp_path / "x.mot", names="opensim").diagnostics
-    }
+    diagnostics = export(folder, tmp_path / "x.mot", names="opensim").diagnostics
+    assert "orientation-residual" in {each.code for each in diagnostics}
     export(folder, tmp_path / "x.sto")
     export(folder, tmp_path / "placement.sto", "placement")
     solved, ours = peer("opensense", tmp_path), peer("read", tmp_path / "x.mot")

@@ -51,26 +51,8 @@ class QuickOptions(GuideOptions):
         return calibrate(load_session(source), measured={**self.measured, **(entered or {})})
 
 
-def make_guide(
-    source: PersonSource,
-    folder: Path,
-    known: Mapping[str, str] | None = None,
-    mounts: Mapping[str, np.ndarray] | None = None,
-    protocol: str = "clasp",
-    clasp_s: float = CLASP_S,
-    given: Mapping[str, float] = MEASURED,
-) -> Guide:
-    """A guide whose clasp is short."""
-    text = CLASP.read_text(encoding="utf-8")
-    (folder / "clasp.toml").write_text(text.replace("seconds = 60", f"seconds = {clasp_s}"), encoding="utf-8")
-    parts = protocol.replace("clasp", str(folder / "clasp.toml"))
-    setup = SensorSetup(mounts=mounts or {})
-    options = QuickOptions(folder, setup, load_model(), parts, measured=given, known=known or {})
-    return Guide(source, options, make_steps(options.joined))
-
-
 class Session:
-    """A person in front of a guide; presses what is offered first."""
+    """A person in front of a guide whose clasp is short; presses what is offered first."""
 
     def __init__(
         self,
@@ -85,7 +67,11 @@ class Session:
         self.source = PersonSource(self.person)
         # The closure does not show how a tracker on the torso is turned, and it has no accelerometer to tell.
         mounts = {"torso": perform(*PERSON).quat_LS["torso"]} if orientations == "sensor" else {}
-        self.guide = make_guide(self.source, folder, known or {}, mounts, protocol, clasp_s, given)
+        text = CLASP.read_text(encoding="utf-8").replace("seconds = 60", f"seconds = {clasp_s}")
+        (folder / "clasp.toml").write_text(text, encoding="utf-8")
+        parts, setup = protocol.replace("clasp", str(folder / "clasp.toml")), SensorSetup(mounts=mounts)
+        options = QuickOptions(folder, setup, load_model(), parts, measured=given, known=known or {})
+        self.guide = Guide(self.source, options, make_steps(options.joined))
         self.clicks: list[str] = []
         self.obeys: Callable[[str, Any], str] = lambda _step, view: view.highlight
 

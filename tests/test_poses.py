@@ -29,15 +29,8 @@ SEED = 5301
 def perform(protocol: str) -> tuple[Person, Simulation]:
     person = simulate_person(SEED, 0.012)
     imperfections = replace(PEOPLE_PRESET, mount="any")
-    return person, simulate(
-        person.lengths,
-        seed=SEED,
-        rate_hz=50.0,
-        imperfections=imperfections,
-        clasp_s=50.0,
-        circles=0,
-        protocol=protocol,
-    )
+    options = {"rate_hz": 50.0, "clasp_s": 50.0, "circles": 0}
+    return person, simulate(person.lengths, seed=SEED, imperfections=imperfections, protocol=protocol, **options)
 
 
 def solve(person: Person, recording: Recording, protocol: str) -> Calibration:

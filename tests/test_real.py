@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.trials import (
-    Referenced,
-)
+from benchmarks.trials import Referenced
 from benchmarks.validation import real
 from benchmarks.validation.experiment import run_experiment
 from benchmarks.validation.registration import register_sensors

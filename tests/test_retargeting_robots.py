@@ -72,7 +72,6 @@ def test_violent_arms_do_not_touch(motion: tuple[float, ...]) -> None:
 
 @pytest.fixture(scope="session")
 def tracked(data: Path) -> Pose:
-
     return wp.track(wp.load_session(data / "upper_body" / "session.toml")).pose
 
 
