@@ -62,15 +62,8 @@ def _measure_in_a_folder(measure: Callable[[Path], Table]) -> Table:
 
 
 def run(*words: object) -> None:
-    """Run a command of `wepose` without what it prints.
-
-    Raises
-    ------
-    BadData
-        It ends with an exit code that is not 0.
-    """
-    printed = io.StringIO()
-    code: object = None
+    """Run a command of `wepose` without what it prints; `BadData`: its exit code is not 0."""
+    printed, code = io.StringIO(), None
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         try:
             main([str(word) for word in words])

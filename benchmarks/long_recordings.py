@@ -83,23 +83,14 @@ def there_and_back(recording: Recording, rest: slice) -> Recording:
         bias = sensor.gyro_S[rest].mean(axis=0)
         # The rate at a sample is that of the interval which ends there; backwards it is the one that begins there.
         back = np.roll(2.0 * bias - sensor.gyro_S[::-1], 1, axis=0)
-        sensors[name] = replace(
-            sensor,
-            gyro_S=np.concatenate([sensor.gyro_S, back]),
-            accel_S=np.concatenate([sensor.accel_S, sensor.accel_S[::-1]]),
-        )
+        accel_S = np.concatenate([sensor.accel_S, sensor.accel_S[::-1]])
+        sensors[name] = replace(sensor, gyro_S=np.concatenate([sensor.gyro_S, back]), accel_S=accel_S)
     n = 2 * len(recording)
     return replace(recording, time=np.arange(n) / recording.rate_hz, sensors=sensors)
 
 
 def _track(folder: Path, hours: float) -> dict[str, float]:
-    """Track in a process of its own, and return what that costs.
-
-    Raises
-    ------
-    NoSolution
-        It fails.
-    """
+    """Track in a process of its own, and return what that costs; `NoSolution`: it fails."""
     session = folder / f"{hours:g}"
     argv = [sys.executable, "-m", "wepose_pin", "track", str(session), "-o", str(folder / "out"), "--force"]
     argv += ["--subject", str(session / "subject"), "--no-report"]

@@ -42,11 +42,7 @@ MARGINS = (
     Column("jerk", "jerk", 1),
     Column("collisions", "contact", 0),
 )
-ERRORS = (
-    Column("hand", "median", 1),
-    Column("hand_90", "90 %", 1),
-    Column("infeasible", "unsolved", 3),
-)
+ERRORS = (Column("hand", "median", 1), Column("hand_90", "90 %", 1), Column("infeasible", "unsolved", 3))
 NOTE = (
     "Hands against their targets inside the reach [mm]; steps without a solution [%]; margins to the limits of URDF "
     "and map: position [rad], others [%]; samples in self-contact, by the robot's own shapes."

@@ -40,10 +40,7 @@ class Timing(NamedTuple):
 
 
 def time_in_turn(
-    cases: Mapping[str, Callable[[], Any]],
-    rounds: int,
-    reference: str,
-    clock: Callable[[], float] = time.thread_time,
+    cases: Mapping[str, Callable[[], Any]], rounds: int, reference: str, clock: Callable[[], float] = time.thread_time
 ) -> dict[str, Timing]:
     """Each case timed once a round, after one unmeasured round.
 

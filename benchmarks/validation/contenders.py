@@ -56,23 +56,18 @@ def list_contenders(setting: str, trial: str = "") -> list[Contender]:
     filters = [_make_ours(method) for method in METHODS if method not in (*tuned, PUBLISHED)]
     # Of people it enters as measured orientations: joint accelerations are not the paper's.
     filters.append(_make_ours(PUBLISHED)._replace(method=None))
-    filters += [_make_tuned(method, params) for method, params in tuned.items()]
+    filters += [_make_ours(method, params) for method, params in tuned.items()]
     filters += [_make_default(method, params) for method, params in DEFAULT_GAINS.items()]
     return filters + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
 
 
-def _make_ours(method: str) -> Contender:
-    def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, method).quat_VS
+def _make_ours(method: str, params: Any = None) -> Contender:
+    """Make the contender of a filter of ours, with its defaults or with `params`."""
 
-    return Contender(method, orient, method)
-
-
-def _make_tuned(method: str, params: Any) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         return run_filter(gyro_S, accel_S, rate_hz, noise, method, params).quat_VS
 
-    return Contender(method, orient)
+    return Contender(method, orient, method if params is None else None)
 
 
 def _make_default(method: str, params: Any) -> Contender:
