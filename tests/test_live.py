@@ -171,7 +171,7 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
 def test_takes_and_marks_are_phases_and_texts_of_the_recording(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live.LiveLoop, "STATUS_PERIOD_S", 0.0)
+    monkeypatch.setattr(live.LiveLoop, "STATUS_PERIOD_S", 2e-2)
     file = tmp_path / "a.mcap"
     take, phase = Request("take"), Request("phase", "clasp")
     asked = [(9.0, take), (12.0, Request("text", "trial 3")), (15.0, take), (16.0, phase), (18.0, phase), (20.0, take)]
@@ -189,11 +189,11 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(
     labels = {(action.label, action.is_on) for status in watcher.statuses for action in status.actions}
     assert {("Begin take", False), ("End take 1", True), ("End clasp", True), ("End take 2", True)} <= labels
     # They change no pose, but for the clasp, which corrects headings.
-    run(recording, tmp_path / "b.mcap")
+    run(recording.cut(slice(0, 2000)), tmp_path / "b.mcap")
     unmarked = read_live_log(tmp_path / "b.mcap").quat_WL
     before = round((phases["clasp"][0][0] - recording.time[log.first]) * recording.rate_hz)
     assert np.array_equal(log.quat_WL[:before], unmarked[:before])
-    assert not np.array_equal(log.quat_WL, unmarked)
+    assert not np.array_equal(log.quat_WL[: len(unmarked)], unmarked)
 
 
 @pytest.mark.parametrize("method", ["amekf", pytest.param("smekf", marks=pytest.mark.slow), "ncf"])
