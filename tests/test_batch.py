@@ -66,7 +66,7 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     (study / "data" / "bad").mkdir()
     (study / "data" / "bad" / "session.toml").write_text("[data]\nfile = 3\n")
     (study / "data" / "two" / "truth.parquet").unlink()
-    calls: list[tuple[int, int, int]] = []
+    calls: list[tuple[str, float]] = []
     outcome = run_batch(study / "plan.toml", str(study / "out"), workers=2, progress=lambda *now: calls.append(now))
     table = outcome.table
     assert table.equals(pl.read_parquet(study / "out" / "results.parquet"))
@@ -75,7 +75,7 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     assert table["error"].to_list() == ["BadSession", None, None, "MissingFile"]
     assert all(str(study) in text and "\n" not in text for text in table["message"].drop_nulls())
     assert table["right_palm_error_mm"].drop_nulls().max() < 100.0  # type: ignore[operator]
-    assert (calls[0], calls[-1]) == ((0, 0, 4), (4, 2, 4))
+    assert (calls[0], calls[-1]) == (("starting workers", 0.0), ("4 of 4 items, 2 failed", 1.0))
     assert sorted(path.name for path in (study / "out" / "items").iterdir()) == ["data-one", "data-three"]
     before = files(study / "out" / "items")
     (study / "data" / "bad" / "session.toml").unlink()

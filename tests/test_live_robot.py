@@ -64,7 +64,7 @@ class Session:
 
     def __init__(self, robot: retargeting.Robot, pose: wp.Pose, **options: Any) -> None:
         self.robot, self.data = robot, robot.model.createData()
-        self.stream = retargeting.CommandStream(robot, retargeting.StreamOptions(rate_hz=1.0 / DT, **options))
+        self.stream = retargeting.CommandStream(robot, rate_hz=1.0 / DT, **options)
         self.observer = retargeting.ArmObserver(robot, tuple(pose.quat_WL), tuple(pose.points))
         self.commands: list[retargeting.Command] = []
         self.hand: list[np.ndarray] = []

@@ -15,7 +15,7 @@ import wepose_pin as wp
 from wepose_pin import MILD_PRESET, simulate_person
 from wepose_pin.writers import write_session
 
-SECTIONS = ["Lengths", "Sensors", "Palm to palm over time", "The motion in 3D", "What was run"]
+SECTIONS = ["Lengths", "Sensors", "Palm to palm over time"]
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +48,7 @@ def test_it_says_how_well_lengths_and_mounts_are_known(session: Path, tmp_path: 
     assert banner == [{0: "pass", 3: "poor", 4: "fail"}[code]]
 
     assert is_self_contained(page)
-    assert 'sandbox="allow-scripts"' in page
-    assert len(page) < 3e6
-    assert re.search(r"@media print \{.*\.screen.*display: none", page, re.DOTALL)
+    assert len(page) < 1e6
     assert "anna &lt;3" in page
     assert "anna <3" not in without_frame(page)
     pairs = captions(page)

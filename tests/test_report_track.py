@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from commands import run
 from PIL import Image
-from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of
+from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
@@ -27,13 +27,12 @@ SECTIONS = [
     "The hands",
     "Joint angles",
     "The motion in 3D",
-    "What was run",
 ]
 
 
 def report(result: wp.TrackResult) -> str:
     """The page, without the motion in 3D."""
-    return render_track_report(summarize(result), view="<p>mine</p>")
+    return without_frame(render_track_report(summarize(result)))
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +73,8 @@ def test_it_opens_offline_with_its_sections_and_five_figures_each_with_a_caption
     assert len(pairs) == 5  # the sensors, headings, paths and reach of the hands, joint angles
     assert all(label == caption for label, caption in pairs)
     assert 'title="The motion in 3D"' in page
+    assert 'sandbox="allow-scripts"' in page
+    assert re.search(r"@media print \{.*\.screen.*display: none", page, re.DOTALL)
     assert "anna &lt;3" in page
     assert is_self_contained(page)
     assert "@media screen and (prefers-color-scheme: dark)" in page
@@ -105,7 +106,7 @@ def test_it_gives_the_sensors_and_joints_in_numbers(page: str, result: wp.TrackR
 
 
 def test_a_known_person_and_nothing_to_say(result: wp.TrackResult, page: str) -> None:
-    assert "wepose calibrate measures those of the person" in text_of(page)
+    assert "wepose calibrate measures the lengths of the person" in text_of(page)
     text = text_of(report(replace(result, subject=replace(result.subject, name="anna", note=""))))
     assert "No warnings." in text
     assert "wepose calibrate" not in text

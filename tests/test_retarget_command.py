@@ -73,7 +73,6 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     page = (tmp_path / "out" / "view.html").read_text()
     assert '"robot 0"' in page
     assert '"right_robot"' in page
-    assert '"target right"' in page
     report = (tmp_path / "out" / "report.html").read_text()
     assert "cannot be made" not in report
     for joint in JOINTS:

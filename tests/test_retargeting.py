@@ -56,14 +56,14 @@ def test_a_motion_leaves_the_margins_that_are_asked_for(arm, swung: retargeting.
     stated = "[limits.position]\nelbow = [-1.5, -0.7]\n[limits.velocity]\nelbow = 0.8\n[arms.right]"
     said = urdf.with_suffix(".toml").read_text().replace("[arms.right]", stated)
     urdf.with_suffix(".toml").write_text(said)
-    narrow = retargeting.load_robot(retargeting.find_map(str(urdf)), margins=retargeting.LimitMargins(0.5, 0.1))
+    narrow = retargeting.load_robot(retargeting.find_map(str(urdf)), speed_scale=0.5, limit_margin=0.1)
     trajectory = retargeting.retarget(person(3.0), narrow)
     is_sound(trajectory)
     elbow = JOINTS.index("elbow")
     assert trajectory.joint_position[:, elbow].min() >= -1.4 - 1e-8  # the bounds are searched to 1e-9
     assert trajectory.joint_position[:, elbow].max() <= -0.8 + 1e-8
-    assert np.abs(trajectory.run.joint_velocity[:, elbow]).max() <= 0.4 + 1e-8
-    assert np.abs(trajectory.run.joint_acceleration).max() <= 6.0 + 1e-8
+    assert np.abs(trajectory.joint_velocity[:, elbow]).max() <= 0.4 + 1e-8
+    assert np.abs(trajectory.joint_acceleration).max() <= 6.0 + 1e-8
     table = retargeting.build_table(swung)
     assert retargeting.check_limits(table, arm.map).passed
     assert retargeting.check_limits(table, narrow.map).position < -0.1
@@ -101,8 +101,8 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: retargeting.Trajectory) ->
 
 def test_it_begins_and_ends_at_rest_and_shows_the_recording_to_its_end(swung: retargeting.Trajectory) -> None:
     assert np.array_equal(swung.joint_position[0], swung.robot.rest)
-    assert not swung.run.joint_velocity[0].any()
-    assert np.abs(swung.run.joint_velocity[-1]).max() < 1e-12
+    assert not swung.joint_velocity[0].any()
+    assert np.abs(swung.joint_velocity[-1]).max() < 1e-12
     assert (np.diff(swung.recorded_time) >= -1e-12).all()
     assert swung.recorded_time[0] == swung.recorded_time[swung.approach_samples - 1] == 0.0
     assert swung.recorded_time[-1] == pytest.approx(7.99, abs=0.02)
@@ -115,7 +115,7 @@ def test_a_task_can_be_left_out(arm, only: str) -> None:
     is_sound(trajectory)
     target, begin = trajectory.targets[0], trajectory.approach_samples
     asked = Rotation.from_matrix(target.rotation[begin:])
-    turn = (Rotation.from_matrix(trajectory.run.rotation[0, begin:]).inv() * asked).magnitude()
+    turn = (Rotation.from_matrix(trajectory.R_BH[0, begin:]).inv() * asked).magnitude()
     if only == "position":
         assert np.median(error(trajectory)) < 3e-3
     else:
@@ -169,7 +169,7 @@ def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:
 
 def test_five_seconds_out_of_reach(arm, swung: retargeting.Trajectory) -> None:
     pose = far_away(person(11.0, swing=0.0), (3.0, 8.0), 1.6)
-    trajectory = retargeting.retarget(pose, arm, scale=swung.arm_targets.scale["right"])
+    trajectory = retargeting.retarget(pose, arm, scale=swung.scale["right"])
     is_sound(trajectory)
     target = trajectory.targets[0]
     outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
@@ -177,8 +177,8 @@ def test_five_seconds_out_of_reach(arm, swung: retargeting.Trajectory) -> None:
     why = summarized(trajectory)["error_attribution"]
     assert why["beyond the reach"] == pytest.approx(outside[trajectory.approach_samples :].mean(), abs=0.1)
     settled = (trajectory.recorded_time > 5.5) & (trajectory.recorded_time < 7.5)
-    assert np.abs(trajectory.run.joint_velocity[settled]).max() < 0.02  # still at the reach: it does not shake
-    assert np.abs(np.diff(trajectory.run.joint_acceleration[settled], axis=0)).max() < 0.05 * 12.0
+    assert np.abs(trajectory.joint_velocity[settled]).max() < 0.02  # still at the reach: it does not shake
+    assert np.abs(np.diff(trajectory.joint_acceleration[settled], axis=0)).max() < 0.05 * 12.0
     back = trajectory.recorded_time > 9.5
     assert np.linalg.norm(trajectory.hand["right"] - target.position, axis=1)[back].max() < 0.02
 
@@ -228,7 +228,7 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     trajectory = retargeting.retarget(replace(pose, points=points), arm)
     is_sound(trajectory)
     assert error(trajectory)[-1] > 0.05  # it could not get there
-    assert trajectory.run.report.near_contact.any()
+    assert trajectory.report.near_contact.any()
     why = summarized(trajectory)["error_attribution"]
     assert why["self-collision"] > 0.2
     assert why["self-collision"] > 0.9 * sum(why.values())
@@ -240,5 +240,5 @@ def test_too_fast_is_slowed(tmp_path: Path) -> None:
     trajectory = retargeting.retarget(pose, slow)
     is_sound(trajectory)
     assert trajectory.time[-1] - trajectory.time[trajectory.approach_samples] > 1.3 * 4.0
-    assert trajectory.limiting_joint is not None
-    assert trajectory.limiting_joint.joint in JOINTS
+    assert trajectory.slowest is not None
+    assert trajectory.slowest["joint"] in JOINTS

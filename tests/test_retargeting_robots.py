@@ -88,4 +88,4 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
     robot = retargeting.load_robot(retargeting.find_map(name))
     trajectory = retargeting.retarget(pose, robot)
     is_sound(trajectory)
-    assert not trajectory.run.report.stopping.any()
+    assert not trajectory.report.stopping.any()

@@ -138,12 +138,12 @@ def test_nothing_of_a_robot_on_a_table_goes_below_it(tmp_path: Path) -> None:
     urdf.with_suffix(".toml").write_text(said.replace('forward = "+x"', 'forward = "+x"\ntable = -0.6'))
     robot = retargeting.load_robot(retargeting.find_map(str(urdf)))
     with pytest.raises(errors.WeposeError, match="rest, table: forearm_0 is in the table in the rest posture"):
-        retargeting.retarget(person(2.0), retargeting.load_robot(replace(robot.map, table=-0.4)))
+        retargeting.retarget(person(2.0), retargeting.load_robot(robot.map._replace(table=-0.4)))
     pose = person(4.0, flexion=15.0)  # the hand hangs 0.6 m below the shoulder
     lowest = {}
     for name, own in (
         ("table", robot),
-        ("none", retargeting.load_robot(replace(retargeting.find_map(str(urdf)), table=None))),
+        ("none", retargeting.load_robot(retargeting.find_map(str(urdf))._replace(table=None))),
     ):
         trajectory = retargeting.retarget(pose, own)
         base = own.full.frames[own.full.getFrameId("base")].placement

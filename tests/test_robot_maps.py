@@ -106,9 +106,6 @@ def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
         errors.WeposeError, match=r"right arm follows right_.*; an arm needs sensors on torso, upper arm and forearm"
     ):
         retargeting.retarget(person(2.0, side="left"), arm)
-    has_both = replace(arm.map, arms=arm.map.arms | {"left": arm.map.arms["right"]})  # of which one was selected
-    with pytest.raises(errors.WeposeError, match=r"arm's right arm follows right_[^;]*; choose arm left$"):
-        retargeting.retarget(person(2.0, side="left"), replace(arm, map=has_both))
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
@@ -117,12 +114,6 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         retargeting.find_map("pandas")
     with pytest.raises(errors.WeposeError, match=r"--arm left: arm has no left arm; there is: right"):
         retargeting.load_robot(retargeting.find_map(str(urdf)), ("left",))
-    text = urdf.with_suffix(".toml").read_text()
-    urdf.with_suffix(".toml").write_text(f"{text}[collision.w1]\nxyz = [0.0, 0.0, 0.1]\n")
-    with pytest.raises(
-        errors.WeposeError, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"
-    ):
-        load(urdf)
     urdf.with_suffix(".toml").unlink()
     with pytest.raises(errors.WeposeError, match=r"no arm.toml beside it; a robot needs a map"):
         retargeting.find_map(str(urdf))

@@ -16,7 +16,7 @@ from .inputs import REAL, makers, read_known
 
 BROAD = ("01_undisturbed_slow_rotation_A.mat", "16_undisturbed_fast_translation_B.mat", "25_disturbed_tapping_B.mat")
 # One of each kind: five joints on a table, two arms, shapes that the map places. The others are of these kinds.
-OTHER_ROBOTS = ("so101", "baxter", "alex")
+OTHER_ROBOTS = ("so101", "baxter")
 DEVICE_FILES = (
     ("mvnx", "test_mocap.mvnx"),
     ("mvnx", "Meri-020.mvnx"),

@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from ..commands.options import Count
-from ..commands.output import Outcome, print_table, progress_bar, say
+from ..commands.output import Outcome, progress_bar, say
 
 
 def batch(
@@ -44,26 +44,21 @@ def batch(
     force
         Run those items again whose inputs, options or package have changed. Without it they are kept as "changed".
     """
+    import polars as pl
+
     from .study import run_batch
 
     try:
         with progress_bar() as progress:
-
-            def show(done: int, failed: int, total: int) -> None:
-                text = f"{done} of {total} items" + (f", {failed} failed" if failed else "")
-                progress(text if done or not total else "starting workers", done / max(total, 1))
-
-            study = run_batch(plan, out, scheduler=scheduler, workers=workers, force=force, progress=show)
+            study = run_batch(plan, out, scheduler=scheduler, workers=workers, force=force, progress=progress)
     except KeyboardInterrupt:
         print("wepose: stopped; what is done stays, and the same command goes on from there", file=sys.stderr)
         raise SystemExit(130) from None
     failed = study.table.filter(study.table["status"] != "done")
     if failed.height:
-        causes = failed["error"].value_counts(sort=True).iter_rows()
-        print_table("Not done", ("cause", "items"), [(cause, str(count)) for cause, count in causes])
-        first = failed.unique("error", keep="first", maintain_order=True)
-        for item, message in first.select("item", "message").iter_rows():
-            say(f"  {item}: {message}")
+        causes = failed.group_by("error", maintain_order=True).agg(pl.len(), pl.first("item"), pl.first("message"))
+        for cause, count, item, message in causes.sort("len", descending=True).iter_rows():
+            say(f"Not done: {count} by {cause}, such as {item}: {message}")
     reused = f", {study.reused} of them before" if study.reused else ""
     say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
     say(f"Table: {out.rstrip('/')}/results.parquet")

@@ -8,7 +8,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..body import list_breadths, load_table
 from ..commands.command_line import APP, parse
@@ -26,19 +26,9 @@ STEPS = {
     "evaluate": ("result", "truth"),
 }
 _LONGEST_NAME = 100  # letters of an item's folder
-
-
 PERSON = ("stature", "sex", "measured")  # options of `calibrate` that belong to a person
 # Follow from an item's session and subject, or are not of one session.
 _ITEM_OPTIONS = ("out", "subject", "format", "episodes", "instruction", "force", *PERSON)
-
-
-class Subject(NamedTuple):
-    """``[subjects.NAME]``: calibrated by a session, before (`file`), or with each session (neither)."""
-
-    person: Mapping[str, Any]
-    file: str = ""
-    calibration: str = ""
 
 
 @dataclass(frozen=True)
@@ -49,19 +39,15 @@ class Item:
     session: str  # path or URL
     steps: Mapping[str, Mapping[str, Any]]  # step → the options that the plan gives
     subject: str | None = None  # a name of the plan
-    subject_file: str | None = None  # path or URL
+    subject_file: str = ""  # path or URL
     person: Mapping[str, Any] = field(default_factory=dict)  # options of `calibrate`
 
 
-class Plan(NamedTuple):
-    """The items of a study, in the order of the file; `calibrations` of subjects run before `items`."""
+def read_plan(path: Path, items_folder: str) -> tuple[list[Item], list[Item]]:
+    """Calibrations of subjects and the items that need them, in the order of the plan; find its sessions.
 
-    calibrations: tuple[Item, ...]
-    items: tuple[Item, ...]
-
-
-def read_plan(path: Path, items_folder: str) -> Plan:
-    """Read a plan and find its sessions; `items_folder` will hold the items' folders. A mistake is a `WeposeError`."""
+    `items_folder` will hold the items' folders. A mistake is a `WeposeError`.
+    """
     top = TomlTable(read_toml(path, "a plan", BadPlan), str(path), error=BadPlan)
     top.allow("sessions", "subjects", "steps")
     steps = _read_steps(top.table("steps"), path)
@@ -73,12 +59,11 @@ def read_plan(path: Path, items_folder: str) -> Plan:
         session, name = keys.values["session"], keys.text("subject", None)
         if name and name not in subjects and (subjects or "calibrate" not in steps):
             raise BadPlan(f"{keys.where}: subject '{name}' is not in the plan; {one_of(subjects, name)}")
-        subject = subjects.get(name or "", Subject({}))
-        person, file = _read_person(keys, "session", "name", "subject") or subject.person, subject.file
-        if subject.calibration:
+        person, file, calibration = subjects.get(name or "", ({}, "", ""))
+        person = _read_person(keys, "session", "name", "subject") or person
+        if calibration:
             folder = f"subject-{_sanitize(name or '')}"
-            only = {"calibrate": steps["calibrate"]}
-            calibrations[folder] = Item(folder, subject.calibration, only, name, person=person)
+            calibrations[folder] = Item(folder, calibration, {"calibrate": steps["calibrate"]}, name, person=person)
             file = f"{items_folder}/{folder}/calibrate/subject.toml"
         own = {step: options for step, options in steps.items() if not (file and step == "calibrate")}
         if not own:
@@ -86,8 +71,8 @@ def read_plan(path: Path, items_folder: str) -> Plan:
         folder = _sanitize(keys.text("name", None) or "") or _derive_name(session, path)
         if folder in items or folder in calibrations:
             raise BadPlan(f"{keys.where}: '{folder}' names two items; the column 'name' of a table can name them")
-        items[folder] = Item(folder, session, own, name, file or None, person)
-    return Plan(tuple(calibrations.values()), tuple(items.values()))
+        items[folder] = Item(folder, session, own, name, file, person)
+    return list(calibrations.values()), list(items.values())
 
 
 def write_words(step: str, places: Sequence[str], options: Mapping[str, Any]) -> list[str]:
@@ -145,7 +130,8 @@ def _check_options(keys: TomlTable, step: str, options: Mapping[str, Any]) -> No
         raise BadPlan(f"{keys.where}: {error}") from None
 
 
-def _read_subject(keys: TomlTable, path: Path, steps: Collection[str]) -> Subject:
+def _read_subject(keys: TomlTable, path: Path, steps: Collection[str]) -> tuple[Mapping[str, Any], str, str]:
+    """What is known of a person, and the file or the session of the calibration, if any, else each session's own."""
     person = _read_person(keys, "file", "calibration")
     file, calibration = (_resolve(keys.text(name, None) or "", path) for name in ("file", "calibration"))
     if calibration and file:
@@ -155,7 +141,7 @@ def _read_subject(keys: TomlTable, path: Path, steps: Collection[str]) -> Subjec
     place = calibration or file
     if place and not is_remote(place) and not Path(place).exists():
         raise BadPlan(f"{keys.where}: {place}: no such file; a path from the plan's folder, or a URL, is needed")
-    return Subject(person, file, calibration)
+    return person, file, calibration
 
 
 def _read_person(keys: TomlTable, *others: str) -> dict[str, Any]:
@@ -206,7 +192,6 @@ def _derive_name(session: str, path: Path) -> str:
 
 
 def _sanitize(text: str) -> str:
-    """A text as the name of a folder."""
     return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".")[:_LONGEST_NAME]
 
 

@@ -1,36 +1,48 @@
-"""A study: the items of a plan on local processes or on a Dask scheduler, and the table of outcomes."""
+"""A study: the items of a plan on local processes or on a Dask scheduler, and the table of outcomes.
+
+The steps of an item run in a new folder, which appears whole or not at all; what is done stays.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import signal
+import tempfile
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import polars as pl
 
-from ..errors import BadOption, LostWorker, how_to_install, reason
+from ..commands.command_line import parse
+from ..errors import BadOption, ExistingOutput, LostWorker, WeposeError, how_to_install, reason
 from ..filters.base import count_processors
-from .items import DONE, Row, fail, run_item
-from .plan import Item, read_plan
-from .storage import is_remote, open_study, write_bytes
+from ..writers.provenance import code, file_hashes
+from ..writers.result import as_json
+from .plan import STEPS, Item, read_plan, write_words
+from .storage import DONE_FILE, create_folder, fetch, is_remote, open_study, read_bytes, write_bytes
 
-RESULTS = "results.parquet"
 CONNECT_S = 10.0  # for which a scheduler is waited for
+DONE, FAILED, CHANGED = "done", "failed", "changed"  # status of an item
 # Columns of every row, before those of its steps.
 _COMMON = dict.fromkeys(("item", "session", "subject", "status", "error", "message"), pl.String)
 # Processes share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _ONE_THREAD = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
 _DIED = "the process of this item, or of one beside it, died; it may lack memory"
 
-# Called with the number of items that have a row, of those that are not done, and of all.
-ItemProgress = Callable[[int, int, int], None]
+Row = dict[str, Any]  # of the table: column → value
+RunItem = Callable[[Item], Row]
 
 
 class Study(NamedTuple):
@@ -47,12 +59,11 @@ def run_batch(
     scheduler: str | None = None,
     workers: int | None = None,
     force: bool = False,
-    progress: ItemProgress = lambda *_: None,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> Study:
     """Run all items of a plan and write ``results.parquet``, in a folder or below a URL; options as those of `batch`.
 
-    Items that were done before are reused where nothing has changed. A mistake in the plan or the place is a
-    `WeposeError`; the errors of an item are in its row.
+    A mistake in the plan or the place is a `WeposeError`; the errors of an item are in its row.
     """
     if workers is not None and scheduler is not None:
         raise BadOption(f"--workers {workers}: leave it out; the workers of --scheduler are running already")
@@ -63,41 +74,41 @@ def run_batch(
     rows: dict[str, Row] = {}
     count = workers or count_processors()  # before the processes of items get one thread each
     with open_study(out), _one_thread():
-        progress(0, 0, len(names))
+        progress("starting workers", 0.0)
         for items in plan:  # sessions need the calibrations
-            if scheduler is None:
-                run = _run_here(items, count, place, force)
-            else:
-                run = _run_on_scheduler(items, scheduler, place, force)
-            with contextlib.closing(run) as done:
+            run = partial(run_item, place=place, force=force)
+            rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, count)
+            with contextlib.closing(rows_done) as done:
                 for row in done:
                     rows[row["item"]] = row
-                    progress(len(rows), sum(each["status"] != DONE for each in rows.values()), len(names))
+                    failed = sum(each["status"] != DONE for each in rows.values())
+                    progress(f"{len(rows)} of {len(names)} items, {failed} failed", len(rows) / len(names))
         reused = sum(row.pop("reused", False) for row in rows.values())
         ordered = [dict.fromkeys(_COMMON) | rows[name] for name in names]
         table = pl.DataFrame(ordered, schema_overrides=_COMMON, infer_schema_length=None)
         content = io.BytesIO()
         table.write_parquet(content)
-        write_bytes(f"{out}/{RESULTS}", content.getvalue())
+        write_bytes(f"{out}/results.parquet", content.getvalue())
     return Study(table, reused)
+
+
+# Where items run ------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Processes that start within the block have one thread each."""
-    names = _ONE_THREAD.split()
-    before = {name: os.environ[name] for name in names if name in os.environ}
-    os.environ.update(dict.fromkeys(names, "1"))
+    before = dict(os.environ)
+    os.environ.update(dict.fromkeys(_ONE_THREAD.split(), "1"))
     try:
         yield
     finally:
-        for name in names:
-            del os.environ[name]
+        os.environ.clear()
         os.environ.update(before)
 
 
-def _run_here(items: Sequence[Item], count: int, place: str, force: bool) -> Generator[Row]:
-    """Rows of the items, in the order in which they are done, from processes of this machine.
+def _run_here(run: RunItem, items: Sequence[Item], count: int) -> Generator[Row]:
+    """Rows of the items, in the order in which they are done, from `count` processes of this machine.
 
     A process that dies takes those beside it along: their items fail, and the others go on in new processes.
     """
@@ -105,7 +116,7 @@ def _run_here(items: Sequence[Item], count: int, place: str, force: bool) -> Gen
     while todo:
         pool = ProcessPoolExecutor(min(count, len(todo)), get_context("spawn"), _prepare_process)
         try:
-            futures = {pool.submit(run_item, item, place, force): item for item in todo}
+            futures = {pool.submit(run, item): item for item in todo}
             for future in as_completed(futures):
                 if future.exception() is None:
                     todo.remove(futures[future])
@@ -114,11 +125,12 @@ def _run_here(items: Sequence[Item], count: int, place: str, force: bool) -> Gen
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(active_children()) - before:  # when stopped, an item may have minutes to go
                 process.terminate()
-        lost, todo = todo[:count], todo[count:]  # items begin in their order: the first of those left were running
-        yield from (fail(item, LostWorker.__name__, f"{item.session}: {_DIED}") for item in lost)
+        # Items begin in their order: the first of those left were running.
+        lost, todo = todo[:count], todo[count:]
+        yield from (_fail(item, LostWorker.__name__, f"{item.session}: {_DIED}") for item in lost)
 
 
-def _run_on_scheduler(items: Sequence[Item], address: str, place: str, force: bool) -> Generator[Row]:
+def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Generator[Row]:
     """The same by the workers of a running Dask scheduler; `LostWorker` where it goes meanwhile."""
     try:
         from distributed import Client, KilledWorker
@@ -130,16 +142,15 @@ def _run_on_scheduler(items: Sequence[Item], address: str, place: str, force: bo
     except (OSError, ValueError, TypeError) as error:
         raise BadOption(f"--scheduler {address}: no scheduler there, as in tcp://HOST:8786: {reason(error)}") from None
     with client, client.get_executor(pure=False) as executor:
-        futures = {executor.submit(run_item, item, place, force): item for item in items}
+        futures = {executor.submit(run, item): item for item in items}
         for future in as_completed(futures):
             try:
                 row = future.result()
             except KilledWorker:  # after several workers died at it
-                row = fail(futures[future], LostWorker.__name__, f"{futures[future].session}: {_DIED}")
+                row = _fail(futures[future], LostWorker.__name__, f"{futures[future].session}: {_DIED}")
             except CancelledError:
-                raise LostWorker(
-                    f"{address}: the scheduler is gone; the same command goes on where it stopped"
-                ) from None
+                again = "the scheduler is gone; the same command goes on where it stopped"
+                raise LostWorker(f"{address}: {again}") from None
             yield row
 
 
@@ -147,10 +158,122 @@ def _prepare_process() -> None:
     """Ctrl-C in the terminal is for the parent; a process whose parent was killed ends itself."""
 
     def exit_with_parent() -> None:
-        parent = parent_process()
-        if parent is not None:
+        if (parent := parent_process()) is not None:
             parent.join()
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, daemon=True).start()
+
+
+# One item -------------------------------------------------------------------------------------------------------------
+
+
+def run_item(item: Item, place: str, force: bool) -> Row:
+    """Run an item unless it is done, into a folder below `place`; its row of the table, errors included.
+
+    `force`: run it again where its inputs, options or code have changed; otherwise it is `CHANGED`.
+    """
+    begin = time.perf_counter()
+    try:
+        row = _describe(item) | _run_unless_done(item, f"{place}/{item.name}", force)
+    except Exception as error:
+        message = str(error)
+        if not isinstance(error, WeposeError):  # a bug of ours: other items continue, and the table says where it is
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            message += f" ({Path(last.filename).name}:{last.lineno})"
+        row = _fail(item, type(error).__name__, message)
+    return {"seconds": time.perf_counter() - begin} | row
+
+
+def _describe(item: Item) -> Row:
+    return {"item": item.name, "session": item.session, "subject": item.subject}
+
+
+def _fail(item: Item, error: str, message: str) -> Row:
+    return _describe(item) | {"status": FAILED, "error": error, "message": " ".join(message.split())}
+
+
+def _run_unless_done(item: Item, target: str, force: bool) -> Row:
+    begin = time.perf_counter()
+    inputs = {"session": item.session, "subject_file": item.subject_file}
+    for step, options in item.steps.items():
+        for name in ("model", "prior", "protocol", "robot"):
+            if Path(str(options.get(name, ""))).is_file():
+                inputs[f"{step}.{name}"] = str(options[name])
+    with tempfile.TemporaryDirectory(prefix="wepose-") as fetched:
+        local: dict[str, Path] = {}
+        key: dict[str, Any] = {"code": code()["code"], "options": [list(item.steps.items()), item.person]}
+        for name, url in sorted(inputs.items()):
+            if not url:
+                continue
+            with_truth = name == "session" and "evaluate" in item.steps  # the reference that it names
+            local[name] = fetch(url, Path(fetched), with_truth)
+            key[f"input {name}"] = file_hashes(local[name], with_truth)
+        key = json.loads(json.dumps(key))
+        done: Any = None
+        with contextlib.suppress(ValueError):  # a damaged file is none
+            done = json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
+        changed = [name for name in key if done and done["key"].get(name) != key[name]]
+        if done and not changed:
+            return done["row"] | {"status": DONE, "reused": True}
+        if changed and not force:
+            message = f"{target}: has other {', '.join(changed)}; --force runs it again, -o names another folder"
+            return done["row"] | {"status": CHANGED, "error": ExistingOutput.__name__, "message": message}
+        with create_folder(target) as folder:
+            row = _run_steps(item, local["session"], local.get("subject_file"), folder)
+            row["seconds"] = time.perf_counter() - begin
+            text = json.dumps({"key": key, "row": row}, indent=1, ensure_ascii=False)
+            (folder / DONE_FILE).write_text(text, encoding="utf-8")
+    return row | {"status": DONE}
+
+
+def _run_steps(item: Item, session: Path, subject: Path | None, folder: Path) -> Row:
+    """Run the steps by the commands of their names, each into a folder of its name; column → value."""
+    row: Row = {}
+    places = {"session": str(session), "result": str(folder / "track"), "truth": str(session)}
+    for step, options in item.steps.items():
+        out, inputs = folder / step, [places[name] for name in STEPS[step]]
+        if step == "calibrate":
+            calibration = _run_command(step, inputs, {**options, **item.person, "out": out}).result
+            row |= {"quality": calibration.quality.quality, "gap_mm": 1e3 * calibration.rms_gap}
+            for name, value in calibration.subject.lengths.items():
+                row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": 1e3 * calibration.subject.std(name)}
+            subject = out
+        elif step == "track":
+            summary = _run_command(step, inputs, {**options, "out": out} | ({"subject": subject} if subject else {}))
+            row |= {name: summary[name] for name in ("samples", "rate_hz", "duration_s")}
+            row["diagnostics"] = len(summary["diagnostics"])
+        elif step == "retarget":
+            checks = _run_command(step, inputs, {**options, "out": out}).result
+            row["trajectory_within_limits"] = checks["within_limits"]
+            row["trajectory_self_collisions"] = checks["self_collisions"]["samples"]
+        elif step == "export":
+            out.mkdir()
+            row["export_diagnostics"] = sum(_export(each, inputs, options, out) for each in options["formats"])
+        else:
+            errors = _run_command(step, inputs, options)
+            out.mkdir()
+            text = json.dumps(as_json(asdict(errors)), indent=2)
+            (out / "errors.json").write_text(text + "\n", encoding="utf-8")
+            row |= {f"{point}_limb_error_mm": error.mean for point, error in errors.position_on_limb.items()}
+            row |= {f"{point}_error_mm": error.mean for point, error in errors.position.items()}
+            row |= {f"{segment}_error_deg": error.total_rmse for segment, error in errors.attitude.items()}
+    return {name: None if isinstance(value, float) and not np.isfinite(value) else value for name, value in row.items()}
+
+
+def _export(format: str, inputs: list[str], options: Mapping[str, Any], folder: Path) -> int:
+    """Write a format, with those options that it has; the number of its diagnostics."""
+    from ..writers.export import list_formats
+
+    kind = list_formats()[format]
+    file = folder / (f"motion.{format}" if kind.suffix is None else f"{format}{kind.suffix}")
+    own = {name: value for name, value in options.items() if name in kind.options}
+    return len(_run_command("export", inputs, own | {"out": file, "format": format}).diagnostics)
+
+
+def _run_command(step: str, places: list[str], options: Mapping[str, Any]) -> Any:
+    """What the command of a step returns; what it prints is dropped."""
+    command, bound = parse(write_words(step, places, options))
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return command(*bound.args, **bound.kwargs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -76,6 +77,7 @@ def calibrate(
     from ..body.subject import load_subject
     from ..readers import load_session
     from ..report import calibration as report_room
+    from ..report.page import write_pages
     from ..writers.calibration import write_calibration
     from ..writers.provenance import collect_provenance, result_folder
 
@@ -103,7 +105,8 @@ def calibrate(
             )
             write_calibration(folder, calibration, collect_provenance("calibrate", options))
         progress("writing the report", 2 / 3)
-        failures = report_room.write_calibration_page(out, calibration, recording, method=method, report=report)
+        make = partial(report_room.render_calibration_report, calibration, recording) if report else None
+        failures = write_pages(out, {"report.html": make})
     quality = calibration.quality
     print_diagnostics([*quality.further, *failures])
     print_table(*report_room.tabulate_lengths(calibration))

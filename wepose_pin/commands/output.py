@@ -48,10 +48,7 @@ def say_pages(folder: Path) -> None:
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A table, as reports have it, unless it is empty; the first column is text, the others numbers.
-
-    Without a header: names and values.
-    """
+    """A table, as reports have it, unless it is empty; the first column is text, the others numbers."""
     from rich import box
     from rich.console import Console
     from rich.markup import escape
@@ -60,9 +57,9 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
     rows = list(rows)
     if not rows:
         return
-    table = Table(box=box.SIMPLE_HEAD, show_header=bool(header))
-    for k, name in enumerate(header or ("", "")):
-        table.add_column(escape(name), justify="right" if k and header else "left", no_wrap=bool(header))
+    table = Table(box=box.SIMPLE_HEAD)
+    for k, name in enumerate(header):
+        table.add_column(escape(name), justify="right" if k else "left", no_wrap=True)
     for row in rows:
         table.add_row(*(escape(_shown(cell.replace("**", ""))) for cell in row))
     console = Console(width=TABLE_WIDTH)

@@ -47,7 +47,7 @@ def retarget(
 ) -> Outcome:  # of what summary.json holds
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
-    Robots by name: panda, panda_table, ur5, ur5_table, so101, baxter, tiago_dual, talos, g1, alex. Any other by its
+    Robots by name: panda, panda_table, ur5, ur5_table, so101, baxter, tiago_dual, talos, g1. Any other by its
     URDF with a robot map beside it, a TOML that says which links are shoulder, elbow and hand (docs/robot-maps.md).
 
     Exit code: 0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 one
@@ -131,9 +131,10 @@ def retarget(
         pages = {"view.html": make_view if view else None, "report.html": make_report if report else None}
         failures = write_pages(out, pages)
     print_diagnostics([*map(from_json, summary["diagnostics"]), *failures])
-    for table in (report_room.tabulate_run(summary), *report_room.tabulate_hands(summary)):
+    for table in report_room.tabulate_hands(summary):
         print_table(*table)
-    say_paragraph(report_room.describe_reliance(trajectory, summary))
+    for text in (report_room.describe_run(summary), report_room.describe_reliance(trajectory, summary)):
+        say_paragraph(text)
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     say_pages(out)
     runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]

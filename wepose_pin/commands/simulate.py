@@ -25,7 +25,7 @@ def simulate(
     force: Force = False,
     rate_hz: Annotated[SampleHz, MORE] = 100.0,
     imperfection: Annotated[Imperfection | None, RESEARCH] = None,
-) -> None:
+) -> Any:  # the Person, whose room loads late
     """Simulate the recording of a person with five sensors, or fifteen on the whole body, and its known truth.
 
     The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand.
@@ -122,3 +122,4 @@ def simulate(
     about = f"measured: {lengths}, stature {person.stature:.2f} m, sex {person.sex}"
     say(f"Session: {out / 'session.toml'}  ({about})")
     say(f"Truth: {out / 'truth.parquet'}  {out / 'subject.toml'}")
+    return person

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from ..diagnostics import from_json
 from .options import MORE, RESEARCH, Force, Method, Model, Out, Subject, described_by
-from .output import print_diagnostics, print_table, progress_bar, say, say_pages
+from .output import print_diagnostics, progress_bar, say, say_pages
 
 
 @described_by("tracking/__init__.py:track", "readers/__init__.py:load_session")
@@ -107,7 +106,8 @@ def track(
         failures = write_track_pages(out, summary, view=view, report=report)
     content = summary.content
     print_diagnostics(from_json(each) for each in content["diagnostics"])
-    _print_sensors(content)
+    lengths = content["subject"]["note"] or content["subject"]["name"]
+    say("{recording}: {duration_s:g} s at {rate_hz:g} Hz, {method}, lengths: ".format(**content) + lengths)
     print_diagnostics(failures)
     say_pages(out)
     say(f"Pose: {out / 'pose.parquet'}  ({len(content['sensors'])} segments, {len(content['points'])} points)")
@@ -116,20 +116,3 @@ def track(
     if torques:
         say(f"Torques, estimates: {out / 'torques.parquet'}")
     return content
-
-
-def _print_sensors(summary: Mapping[str, Any]) -> None:
-    """Print the sensors' static share, bias and gravity."""
-    rows = []
-    for segment, about in summary["sensors"].items():
-        row = [segment, "", "orientations from the recording", ""]
-        if "static_share" in about:
-            begin, end = (math.hypot(*about[f"gyro_bias_{when}_deg_s"]) for when in ("start", "end"))
-            row[1:] = f"{100 * about['static_share']:.0f} %", f"{begin:.3f} → {end:.3f}", f"{about['gravity_m_s2']:.3f}"
-        rows.append(row)
-    print_table(
-        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {summary['method']}, "
-        f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
-        ("sensor", "static", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
-        rows,
-    )

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -33,7 +33,8 @@ from ..readers import load_session
 from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
-from ..report.calibration import write_calibration_page
+from ..report.calibration import render_calibration_report
+from ..report.page import write_pages
 from ..simulation import simulate
 from ..writers.calibration import write_calibration
 from ..writers.live_log import LiveLog
@@ -88,7 +89,8 @@ class GuideOptions:
             stated = {"session": source, "measured": measured, "prior": self.subject, "method": self.method}
             with result_folder(source.with_suffix(""), force=True) as folder:
                 write_calibration(folder, calibration, collect_provenance("calibrate", stated | {"protocol": protocol}))
-            write_calibration_page(source.with_suffix(""), calibration, recording, method=self.method)
+            page = partial(render_calibration_report, calibration, recording)
+            write_pages(source.with_suffix(""), {"report.html": page})
         return calibration
 
 

@@ -39,11 +39,11 @@ from ..body import BodyModel
 from ..body.configuration import KinematicsSolver
 from ..body.links import find_known_links
 from ..errors import BadOption
-from ..report.viewer import DARK, LIGHT, Mesh, backdrop, choose_trail_colour, filled, find_floor, scene, view, visible
+from ..report.viewer import DARK, LIGHT, choose_trail_colour, fill_page, find_floor, scene, view
 from ..retargeting.placement import place_beside_person
 from ..retargeting.robot import Robot
 from ..retargeting.targets import find_person_arm
-from ..retargeting.visuals import build_parts
+from ..retargeting.visuals import MeshPart, build_parts
 from .sources.udp import LOOPBACK, name_host
 from .state import QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
 
@@ -184,7 +184,7 @@ class PoseEncoder:
         self, model: BodyModel, robot: Robot | None = None, position: Callable[[], np.ndarray | None] = lambda: None
     ) -> None:
         self.identity = secrets.token_hex(8)  # of the page that draws its frames
-        self.visuals = visible(model.visuals)
+        self.visuals = [visual for visual in model.visuals if visual.kind != "mesh"]
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
         self.newest: LivePose | None = None  # to draw; None: the N-pose
         self.info: StreamInfo | None = None  # of the poses; None before the start
@@ -200,13 +200,15 @@ class PoseEncoder:
             if last in draw.paths:
                 self.reach.append(p_W[first] + (np.linalg.norm(p_W[last] - p_W[first]) + FINGERS) * DIRECTIONS)
         self._robot, self._position = robot, position
-        self._robot_joints, self.meshes = list[int](), list[Mesh]()
+        self._robot_joints, self.meshes = list[int](), list[MeshPart]()
         if robot is not None:
-            parts = build_parts(robot)
+            self.meshes = build_parts(robot)
             heights = [p_W[find_person_arm(model.table, arm.side).points[0]][2] for arm in robot.arms]
             self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
-            self._robot_joints, self._robot_data = sorted({part.joint for part in parts}), robot.model.createData()
-            self.meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
+            self._robot_joints, self._robot_data = (
+                sorted({part.joint for part in self.meshes}),
+                robot.model.createData(),
+            )
             self.reach.append(self._place_robot()[:, 9:])
         self.links = self.body_links + tuple(f"robot {joint}" for joint in self._robot_joints)  # as in the frames
 
@@ -354,16 +356,16 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
     links, body = encoder.links, encoder.body_links
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(body), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = encoder.neutral[:, 9:]
-    backdrops = {name: backdrop(colours, find_floor(model)) for name, colours in (("light", LIGHT), ("dark", DARK))}
+    floor = find_floor(model)
     content = {
         "id": encoder.identity,
         "links": list(links),
         "scene": scene(encoder.visuals, links, encoder.meshes),
-        "backdrops": backdrops,
+        "backdrops": {"light": {**LIGHT, "floor": floor}, "dark": {**DARK, "floor": floor}},
         "view": view(encoder.visuals, body, motion, encoder.reach),
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }
-    return filled("live/templates/live.html.j2", content, title or "wepose live")
+    return fill_page("live/templates/live.html.j2", content, title or "wepose live")
 
 
 def _to_json(value: Any) -> Any:

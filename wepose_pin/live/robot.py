@@ -17,9 +17,9 @@ from ..body.subject import Subject, population_subject
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
 from ..errors import BadOption, WrongOption
-from ..retargeting import LimitMargins, Robot, find_map, load_robot
+from ..retargeting import Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
-from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream, StreamOptions
+from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream
 from ..retargeting.targets import check_person_arms
 from .loop import MAX_LATENCIES
 from .outputs import UdpSender
@@ -199,8 +199,8 @@ def read_robot(name: str) -> tuple[CommandStream, str]:
     )
     sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
     try:
-        chosen = load_robot(find_map(str(neighbour) if neighbour.is_file() else robot), sides, LimitMargins(**margins))
-        return CommandStream(chosen, StreamOptions(**timing)), str(values.get("to", PORT))
+        chosen = load_robot(find_map(str(neighbour) if neighbour.is_file() else robot), sides, **margins)
+        return CommandStream(chosen, **timing), str(values.get("to", PORT))
     except WrongOption as error:
         raise BadOption(f"{name}: {error.name.replace('-', '_')} = {error.value}: {error.needed}") from None
 

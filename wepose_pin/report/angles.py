@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from matplotlib.axes import Axes
 
 from ..angles import Angles, group_sides
 from ..angles.movement import MEASURES, Movement
-from ..angles.repetitions import PERCENT, MeanCurve, list_angles
+from ..angles.repetitions import PERCENT, list_angles
 from .figures import (
     BAND,
     SESSION_COLOURS,
@@ -31,6 +30,10 @@ from .words import Table, number, plain, plus_minus
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
+SESSIONS: list[dict[str, Any]] = [  # lines of the sessions, in turn
+    {"color": colour, "linestyle": dashes}
+    for colour, dashes in zip(SESSION_COLOURS, ("-", "--", ":", "-."), strict=True)
+]
 ADVICE = (
     "State another angle by `--main-angle`, a time by `--interval`, or mark repetitions as intervals of a phase and "
     "name it by `--repetitions`."
@@ -113,17 +116,11 @@ def _describe_reliance(summary: pl.DataFrame) -> str:
 
 def _describe(movements: Sequence[Movement]) -> str:
     cutoff = movements[0].cutoff_hz
-    filtered = (
-        f"Orientations were low-passed at {cutoff:g} Hz: a Butterworth filter of second order, forwards and backwards; "
-        "at the cut-off the amplitude is half (−6 dB)."
-        if cutoff
-        else "Orientations were not low-passed."
-    )
+    filtered = f"low-passed at {cutoff:g} Hz (half the amplitude there)" if cutoff else "not low-passed"
     return (
-        f"{filtered} Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1. Without "
-        "`wepose track --covariance` a pose states one number for all axes of a segment, and the ± of one angle is "
-        "rough. CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1. Angles "
-        "are after the International Society of Biomechanics, with the same signs left and right."
+        f"Orientations were {filtered}. ± between repetitions is one standard deviation. Without `wepose track "
+        "--covariance` a pose states one number for all axes of a segment, and the ± of one angle is rough. "
+        "docs/angles.md has the methods."
     )
 
 
@@ -223,11 +220,6 @@ def draw_joint_angles(angles: Angles, caption: str = "Joint angles over time.") 
     return draw_over_time(angles.time, panels, caption, styles, columns=3)
 
 
-def _session_style(k: int) -> dict[str, Any]:
-    """The line of the k-th session."""
-    return {"color": SESSION_COLOURS[k % len(SESSION_COLOURS)], "linestyle": ("-", "--", ":", "-.")[k % 4]}
-
-
 def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure:
     """The angle by which repetitions were found over time, a row a session."""
     figure = ReportFigure("The main angle over time. Shaded, in turns: the repetitions.", 1.5 * len(repeating))
@@ -239,7 +231,7 @@ def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure
         shade(ax, spans[1::2], "", BAND)
         each = movement.angles[joint]
         values = np.degrees(np.where(each.hidden(place), np.nan, each.values[:, place]))
-        ax.plot(*envelope(movement.angles.time, values), **_session_style(k))
+        ax.plot(*envelope(movement.angles.time, values), **SESSIONS[k % len(SESSIONS)])
     figure.axes[-1].set_xlabel("time [s]")
     return figure
 
@@ -258,23 +250,20 @@ def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: 
             ax.set_title(f"{plain(joint)}: {plain(first.names[place])} [°]")
             ax.set_xlim(0.0, 100.0)
             for k, movement in [(k, each) for k, each in sessions if joint in each.curves]:
+                style, curve = SESSIONS[k % len(SESSIONS)], movement.curves[joint][place]
+                mean, sd = np.degrees(curve.mean), np.degrees(curve.sd)
+                if not np.isfinite(mean).any():
+                    ax.text(50.0, 0.0, "not determined (near gimbal lock)", ha="center", color=SOFT)
+                    continue
+                ax.fill_between(PERCENT, mean - sd, mean + sd, color=style["color"], alpha=0.2, linewidth=0)
+                if alone:
+                    each = np.where(np.isfinite(mean), np.degrees(curve.curves[:MOST_CURVES]), np.nan)
+                    ax.plot(PERCENT, each.T, color=SOFT, linewidth=0.3)
                 label = f"{movement.name}, n = {len(movement.repetitions.spans)}"
-                _draw_curve(ax, movement.curves[joint][place], {**_session_style(k), "label": label}, alone)
+                ax.plot(PERCENT, mean, **style, linewidth=1.8, label=label)
     for ax in row:
         ax.set_xlabel("repetition [%]")
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, 0.5 * (low + high) - 5.0), max(high, 0.5 * (low + high) + 5.0))  # at least 10° high
     figure.add_legend()
     return figure
-
-
-def _draw_curve(ax: Axes, curve: MeanCurve, style: Mapping[str, Any], alone: bool) -> None:
-    mean, sd = np.degrees(curve.mean), np.degrees(curve.sd)
-    if not np.isfinite(mean).any():
-        ax.text(50.0, 0.0, "not determined (near gimbal lock)", ha="center", color=SOFT)
-        return
-    ax.fill_between(PERCENT, mean - sd, mean + sd, color=style["color"], alpha=0.2, linewidth=0)
-    if alone:
-        each = np.where(np.isfinite(mean), np.degrees(curve.curves[:MOST_CURVES]), np.nan)
-        ax.plot(PERCENT, each.T, color=SOFT, linewidth=0.3)
-    ax.plot(PERCENT, mean, **style, linewidth=1.8)

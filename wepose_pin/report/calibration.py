@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
-from pathlib import Path
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration
 from ..calibration.least_squares import MIN_CONTACT
-from ..diagnostics import Diagnostic, lines
-from ..errors import WeposeError
-from ..filters import BEST
+from ..diagnostics import lines
 from ..recording import Recording, compute_mount, find_mount_axes
-from ..tracking import TrackResult, track
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
-from .page import Banner, Item, render_page, write_pages
-from .viewer import show_motion
-from .words import Table, capital, intervals, kinds, listed, number, plain, plus_minus, spread
+from .page import Banner, Item, render_page
+from .words import Table, capital, kinds, listed, number, plain, plus_minus, spread
 
 QUALITIES = {
     "pass": "**Pass:** the calibration is good to use.",
@@ -28,46 +21,23 @@ QUALITIES = {
 }
 
 
-def write_calibration_page(
-    folder: Path, calibration: Calibration, recording: Recording, *, method: str, report: bool = True
-) -> list[Diagnostic]:
-    """Write ``report.html`` beside a calibration's result, as `write_pages`; `method`: as the calibration was run."""
-
-    def make() -> str:
-        tracked = None
-        with contextlib.suppress(WeposeError):  # the paper's formulation estimates no mounts
-            tracked = track(
-                recording, calibration.subject, method=method, model=calibration.problem.model, accept_failed=True
-            )
-        return render_calibration_report(calibration, recording, tracked=tracked, method=method)
-
-    return write_pages(folder, {"report.html": make if report else None})
-
-
-def render_calibration_report(
-    calibration: Calibration, recording: Recording, *, tracked: TrackResult | None = None, method: str = BEST
-) -> str:
-    """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
-
-    `tracked` is the recording tracked with the calibrated subject, for the 3D view; None: there is no view.
-    """
+def render_calibration_report(calibration: Calibration, recording: Recording) -> str:
+    """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic."""
     quality, gap = calibration.quality, capital(_name_gap(calibration))
     entries = lines(quality.further, titled=True)
     has_gap = np.count_nonzero(np.isfinite(calibration.gap)) > 1
-    motion = None if tracked is None else (tracked.model, tracked.pose, recording.phases, recording.name)
     return render_page(
         f"Calibration of {recording.name or 'a recording'}",
         [
             _describe_reliance(calibration),
             Banner(quality.quality, QUALITIES[quality.quality], lines(quality.reasons, titled=True)),
             *([Banner("info", "What to know", entries)] if entries else []),
+            _describe_recording(calibration, recording),
         ],
         {
             "Lengths": [draw_lengths(calibration), _describe_lengths(calibration), tabulate_lengths(calibration)],
             "Sensors": _list_sensors(calibration),
             f"{gap} over time": [draw_gap(calibration, gap), describe_gap(calibration)] if has_gap else [],
-            "The motion in 3D": [show_motion(*motion)] if motion else [],
-            "What was run": [_tabulate_run(calibration, recording, method)],
         },
     )
 
@@ -102,6 +72,15 @@ def _describe_reliance(calibration: Calibration) -> str:
         tilt, heading = mounts[worst]
         text += f" The mount known least is that of the {plain(worst)}: tilt ± {tilt:.1f}°, heading ± {heading:.1f}°."
     return text
+
+
+def _describe_recording(calibration: Calibration, recording: Recording) -> str:
+    problem = calibration.problem
+    return (
+        f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz from {len(recording.sensors)} "
+        f"sensors; protocol {problem.protocol.name}, {len(calibration.time)} samples of it. "
+        f"Prior: {problem.prior.note or problem.prior.name}."
+    )
 
 
 def _describe_lengths(calibration: Calibration) -> str:
@@ -172,25 +151,6 @@ def describe_gap(calibration: Calibration) -> str:
         f"before, {1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
         f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
     )
-
-
-def _tabulate_run(calibration: Calibration, recording: Recording, method: str) -> Table:
-    problem, lengths = calibration.problem, calibration.measured_lengths
-    measured = [
-        f"{plain(n)} {1e3 * lengths[n].metres:.0f} ± {1e3 * lengths[n].measured_std:.0f} mm" for n in problem.measured
-    ]
-    rows = [
-        ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
-        ("phases", "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())),
-        ("sensors", ", ".join(map(plain, recording.sensors))),
-        ("protocol", f"{problem.protocol.name}, {len(calibration.time)} samples of it"),
-        ("filter", method if recording.imus else "none: measured orientations"),
-        ("measured lengths", ", ".join(measured) or "none"),
-        ("prior", problem.prior.note or problem.prior.name),
-        ("sensors mounted again", "yes" if recording.remounted else "no"),
-    ]
-    return Table("", (), rows)
 
 
 def _find_mount_stds(subject: Subject, segment: str) -> tuple[float, float]:

@@ -34,10 +34,9 @@ class Banner(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A view of a motion in the page, for screens only; `more` follows the caption."""
+    """A view of a motion in the page, for screens only."""
 
     page: str
-    more: str = ""
 
 
 Item: TypeAlias = "str | Banner | Table | Frame | ReportFigure"  # a text is a paragraph

@@ -7,7 +7,6 @@ import sys
 import tempfile
 import webbrowser
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 from markupsafe import escape
@@ -29,18 +28,16 @@ def write_track_pages(
     """Write ``view.html`` and ``report.html`` beside a result; as `write_pages`."""
     tracked, recording = summary.tracked, summary.tracked.recording
 
-    @cache
     def make_view() -> str:
         return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name)
 
     def make_report() -> str:
         from .track import render_track_report  # with it comes matplotlib
 
-        return render_track_report(summary, view=make_view() if view else None)
+        return render_track_report(summary)
 
-    return write_pages(
-        folder, {"view.html": make_view if view else None, "report.html": make_report if report else None}
-    )
+    pages = {"view.html": make_view if view else None, "report.html": make_report if report else None}
+    return write_pages(folder, pages)
 
 
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:

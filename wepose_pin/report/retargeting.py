@@ -13,12 +13,10 @@ from ..retargeting.collision import CLEARANCE
 from ..retargeting.files import CAUSES, FAR, find_error_causes
 from .figures import (
     ALARM,
-    COLOURS,
     SESSION_COLOURS,
     SOFT,
     ReportFigure,
     draw_over_time,
-    envelope,
     find_spans,
     line_style,
     styled,
@@ -47,13 +45,13 @@ def render_retargeting_report(
         [
             describe_reliance(trajectory, summary),
             show_diagnostics([*map(from_json, summary["diagnostics"])], reliable, unusable=not runnable),
+            describe_run(summary),
         ],
         {
             "The hands against their targets": [draw_hands(trajectory), *tabulate_hands(summary)],
             "The robot's parts against each other": [_describe_distances(summary)],
             "The joints against their limits": _list_joints(trajectory, summary),
-            "The motion in 3D": [] if view is None else [Frame(view, " Translucent: the targets of the hands.")],
-            "What was run": [tabulate_run(summary)],
+            "The motion in 3D": [] if view is None else [Frame(view)],
         },
     )
 
@@ -61,7 +59,7 @@ def render_retargeting_report(
 def _compute_hand_errors(trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Side → (n,) [mm], the distance of the hand from its target."""
     return {
-        arm.side: 1e3 * np.linalg.norm(trajectory.run.hand[i] - trajectory.targets[i].unclamped, axis=1)
+        arm.side: 1e3 * np.linalg.norm(trajectory.p_BH[i] - trajectory.targets[i].unclamped, axis=1)
         for i, arm in enumerate(trajectory.robot.arms)
     }
 
@@ -111,23 +109,24 @@ def _describe_distances(summary: Mapping[str, Any]) -> str:
 
 
 def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
-    robot, run, margins = trajectory.robot, trajectory.run, trajectory.robot.margins
+    robot = trajectory.robot
     limits, dt = robot.map.read_joint_limits(), float(trajectory.time[1] - trajectory.time[0])
-    jerk = np.diff(run.joint_acceleration, axis=0) / dt
+    jerk = np.diff(trajectory.joint_acceleration, axis=0) / dt
     rows = []
     for j in (j for arm in robot.arms for j in arm.joints.tolist()):
-        name, position, limit = robot.names[j], run.joint_position[:, j], limits[robot.names[j]]
+        name, position, limit = robot.names[j], trajectory.joint_position[:, j], limits[robot.names[j]]
         factor, unit = _choose_unit(limit.kind)
         margin = factor * float(np.minimum(position - limit.lower, limit.upper - position).min())
         most = limit.velocity, robot.map.acceleration[name], robot.map.jerk[name]
-        used = (np.abs(values[:, j]).max() for values in (run.joint_velocity, run.joint_acceleration, jerk))
+        used = (
+            np.abs(values[:, j]).max() for values in (trajectory.joint_velocity, trajectory.joint_acceleration, jerk)
+        )
         shares = (f"{100.0 * value / end:.0f} % of {end:g}" for value, end in zip(used, most, strict=True))
         rows.append([plain(name), number(margin, 1, f" {unit}", unknown="no limit"), *shares])
     return [
-        draw_joints(trajectory),
         Table("", ["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
-        f"Limits are those of the robot's map, else of its URDF. {100 * margins.speed_scale:g} % of those of velocity, "
-        f"acceleration and jerk are used (`--speed-scale`), and {margins.limit_margin:g} rad are left to each position "
+        f"Limits are those of the robot's map, else of its URDF. {100 * robot.speed_scale:g} % of those of velocity, "
+        f"acceleration and jerk are used (`--speed-scale`), and {robot.limit_margin:g} rad are left to each position "
         f"limit (`--limit-margin`). In {100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked, "
         "to keep all limits and a way to stop.",
     ]
@@ -137,17 +136,13 @@ def _choose_unit(kind: str) -> tuple[float, str]:
     return (1e3, "mm") if kind == "prismatic" else (180.0 / np.pi, "°")
 
 
-def tabulate_run(summary: Mapping[str, Any]) -> Table:
+def describe_run(summary: Mapping[str, Any]) -> str:
     """What was run, and how long it lasts."""
-    slowed = f"; {summary['slowdown']:.2f} times as long as recorded" if summary["slowdown"] is not None else ""
-    rows = [
-        ("robot", f"{summary['robot']}, {summary['urdf']}"),
-        ("mount and limits", summary["description"] or "as the map has them"),
-        ("rate", f"{summary['rate_hz']:g} Hz"),
-        ("recorded", f"{summary['recorded_s']:.1f} s"),
-        ("lasts", f"{summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach{slowed}"),
-    ]
-    return Table("", (), rows)
+    slowed = f", {summary['slowdown']:.2f} times as long as recorded" if summary["slowdown"] is not None else ""
+    return (
+        f"{summary['robot']}: {summary['duration_s']:.1f} s at {summary['rate_hz']:g} Hz, of which "
+        f"{summary['approach_s']:.1f} s are the approach{slowed}. {summary['description']}"
+    ).strip()
 
 
 # Figures --------------------------------------------------------------------------------------------------------------
@@ -174,29 +169,4 @@ def draw_hands(trajectory: Trajectory) -> ReportFigure:
                 bars = [(a, max(b - a, time[1] - time[0])) for a, b in find_spans(time, cause == k)]
                 ax.broken_barh(bars, (-0.13 * most, 0.1 * most), facecolor=colour, label=name)
     figure.add_legend()
-    return figure
-
-
-@styled
-def draw_joints(trajectory: Trajectory) -> ReportFigure:
-    """Each joint over time between its limits; a column an arm."""
-    robot, time, limits = trajectory.robot, trajectory.time, trajectory.robot.map.read_joint_limits()
-    rows = max(len(arm.joints) for arm in robot.arms)
-    figure = ReportFigure("The joints over time. Lines across: limits, dashed: less their margins.", 0.85 * rows)
-    axes = figure.grid(rows, len(robot.arms), sharex=True)
-    for column, arm in zip(axes.T, robot.arms, strict=True):
-        for ax in column[len(arm.joints) :]:
-            ax.set_visible(False)
-        for ax, j in zip(column, arm.joints.tolist(), strict=False):
-            limit = limits[robot.names[j]]
-            factor, unit = _choose_unit(limit.kind)
-            ax.set_title(f"{plain(robot.names[j])} [{unit}]")
-            at, values = envelope(time, factor * trajectory.run.joint_position[:, j])
-            ax.plot(at, values, color=COLOURS.get(arm.side, "black"))
-            for end, used in ((limit.lower, robot.lower[j]), (limit.upper, robot.upper[j])):
-                if np.isfinite(end):
-                    ax.axhline(factor * end, color=SOFT, linewidth=0.9)
-                    ax.axhline(factor * float(used), color=SOFT, linewidth=0.8, linestyle="--")
-        column[-1].set_xlabel("time of the robot [s]")
-        column[-1].set_xlim(time[0], time[-1])
     return figure

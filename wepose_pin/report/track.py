@@ -38,24 +38,18 @@ from .figures import (
     styled,
 )
 from .page import Frame, Item, render_page, show_diagnostics
-from .viewer import show_motion
+from .viewer import MOST_FRAMES_INSIDE, pose_html
 from .words import Table, intervals, kinds, listed, number, plain, plural, spread
 
-LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
 VIEWS = (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0))  # axes across and up
 AXES = ("forwards [cm]", "to the left [cm]", "upwards [cm]")
 
 
-def render_track_report(summary: TrackSummary, *, view: str | None = None) -> str:
+def render_track_report(summary: TrackSummary) -> str:
     """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
     Its size does not grow with the recording's length.
-
-    Parameters
-    ----------
-    summary : of `summarize`
-    view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
     """
     tracked, measures = summary.tracked, summary
     recording, table = tracked.recording, tracked.model.table
@@ -63,9 +57,13 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
     with contextlib.suppress(BadData):  # no joint has both of its segments
         angles = joint_angles(tracked.pose, AUTO)
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
-    frame = Frame(view or "")
-    if view is None or len(view) > LARGEST_VIEW:
-        frame = show_motion(tracked.model, tracked.pose, recording.phases, recording.name)
+    page = pose_html(
+        tracked.model,
+        tracked.pose,
+        phases=recording.phases,
+        title=recording.name,
+        most_frames=MOST_FRAMES_INSIDE,
+    )
     return render_page(
         f"Motion of {recording.name or 'a recording'}",
         [
@@ -78,8 +76,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
             "Drift of the headings": _list_drift(tracked),
             f"The {_name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
-            "The motion in 3D": [frame],
-            "What was run": [_tabulate_run(tracked)],
+            "The motion in 3D": [Frame(page)],
         },
     )
 
@@ -126,12 +123,14 @@ def _explain_no_covariance(tracked: TrackResult) -> str:
 def _describe_recording(tracked: TrackResult) -> str:
     recording, time = tracked.recording, tracked.time
     text = (
-        f"{recording.time[-1] - recording.time[0]:.0f} s at {recording.rate_hz:g} Hz from "
-        f"{len(recording.sensors)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
-        "standard deviation throughout: two times out of three the truth lies within."
+        f"{recording.time[-1] - recording.time[0]:.0f} s at {recording.rate_hz:g} Hz from {len(recording.sensors)} "
+        f"sensors, {tracked.options['method'] if recording.imus else 'measured orientations'}. Lengths: "
+        f"{plain(tracked.subject.note or tracked.subject.name)}; mounts "
+        f"{'as the session states them' if has_stated_mounts(tracked) else 'as calibrated'}. ± is one standard "
+        "deviation throughout: two times out of three the truth lies within."
     )
     if tracked.subject.is_population and not tracked.model.table.is_mechanism:
-        text += " `wepose calibrate` measures those of the person."
+        text += " `wepose calibrate` measures the lengths of the person."
     if len(recording) > len(time):
         text += (
             f" Angles and positions are shown for {len(time)} samples, one in {len(recording) / len(time):.0f}; "
@@ -256,21 +255,6 @@ def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
         "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
         "quaternions in pose.parquet have no such singularity.",
     ]
-
-
-def _tabulate_run(tracked: TrackResult) -> Table:
-    recording, subject = tracked.recording, tracked.subject
-    rows = [
-        ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
-        ("filter", tracked.options["method"] if tracked.segments.orientation else "none: measured orientations"),
-        ("start pose", f"{recording.start_pose.replace('_', '-')}, {intervals([tracked.segments.start])}"),
-        ("static phase", intervals([tracked.segments.static_phase])),
-        ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),
-        ("lengths", ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())),
-        ("mounts", "as the session states them" if has_stated_mounts(tracked) else "as calibrated"),
-        ("body model", tracked.model.robot.name),
-    ]
-    return Table("", (), rows)
 
 
 # Figures --------------------------------------------------------------------------------------------------------------

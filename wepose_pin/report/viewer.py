@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import base64
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import distribution
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from markupsafe import Markup
@@ -25,18 +26,19 @@ from ..body.configuration import solve_configuration
 from ..body.kinematics import Pose
 from ..body.links import compute_link_placements, find_known_links
 from ..errors import BadData
-from .page import Frame, load_template
+from .page import load_template
 from .words import plain
 
 if TYPE_CHECKING:
     from ..retargeting import Trajectory
+    from ..retargeting.visuals import MeshPart
 
 FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips, of a body without feet
 FEET_Z = -0.6  # [m] below which a point of a person is at a foot
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
 FRAMES_A_SECOND = 30.0
 MOST_FRAMES, MOST_FRAMES_INSIDE = 20_000, 3000  # of a page, and of one inside a report; the browser interpolates
-MOST_POSES, DIRECTIONS = 150, 100  # by which the camera is placed
+MOST_POSES = 150  # by which the camera is placed
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
 LIGHTS = (  # meshcat's own; positions in W [m]
     ("AmbientLight", 0.66, None),
@@ -44,7 +46,6 @@ LIGHTS = (  # meshcat's own; positions in W [m]
     ("PointLightNegativeX", 0.50, (2.5, 2.0, 2.6)),
     ("PointLightPositiveX", 0.16, (1.0, -3.0, 1.0)),
 )
-GHOST_OPACITY = 0.35  # of a hand at its target
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
 # Colours behind the body, red, green, blue from 0 to 1.
 LIGHT = {"top": (0.985, 0.99, 0.995), "bottom": (0.89, 0.91, 0.935), "grid": (0.70, 0.74, 0.79)}
@@ -52,22 +53,7 @@ DARK = {"top": (0.085, 0.105, 0.130), "bottom": (0.135, 0.160, 0.190), "grid": (
 
 
 Phases: TypeAlias = Mapping[str, Sequence[tuple[float, float]]]  # name → spans (begin, end) [s]
-
-
-class Trail(NamedTuple):
-    """The way of a point, whose last seconds are drawn behind it."""
-
-    points: np.ndarray  # (n, 3) [m] in W, may hold NaN
-    colour: str  # as in CSS
-
-
-class Mesh(NamedTuple):
-    """The triangles (m, 3) of a link, with their vertices (n, 3) [m] in its frame."""
-
-    link: str
-    vertices: np.ndarray
-    triangles: np.ndarray
-    rgba: tuple[float, float, float, float]
+Trails: TypeAlias = Mapping[str, tuple[np.ndarray, str]]  # point → its way (n, 3) [m] in W, may hold NaN; colour in CSS
 
 
 def pose_html(
@@ -96,7 +82,7 @@ def pose_html(
         visuals,
         pose.time[frames],
         placed,
-        trails={name: Trail(pose.points[name][frames], choose_trail_colour(name, model)) for name in paths},
+        trails={name: (pose.points[name][frames], choose_trail_colour(name, model)) for name in paths},
         angles=angles,
         phases=phases,
         title=title,
@@ -112,13 +98,8 @@ def _place_body(
     if q is None:
         q = solve_configuration(model, {segment: quat_WL[samples] for segment, quat_WL in pose.quat_WL.items()})
     known = set(find_known_links(model, pose.quat_WL))
-    visuals = [visual for visual in model.visuals if visual.link in known]
+    visuals = [visual for visual in model.visuals if visual.link in known and visual.kind != "mesh"]
     return visuals, compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
-
-
-def show_motion(model: BodyModel, pose: Pose, phases: Phases, title: str) -> Frame:
-    """A motion inside a report; parameters as `pose_html`."""
-    return Frame(pose_html(model, pose, phases=phases, title=title, most_frames=MOST_FRAMES_INSIDE))
 
 
 def find_floor(model: BodyModel) -> float:
@@ -133,13 +114,10 @@ def find_floor(model: BodyModel) -> float:
 
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "") -> str:
-    """The page on which a person and the robot that does as they do move together, on the robot's time.
-
-    The hands at their targets, beyond the reach too, are drawn translucent.
-    """
+    """The page on which a person and the robot that does as they do move together, on the robot's time."""
     from ..retargeting.placement import place_beside_person
     from ..retargeting.targets import find_person_arm
-    from ..retargeting.visuals import build_parts, compute_placements, compute_target_placements
+    from ..retargeting.visuals import build_parts, compute_placements
 
     frames = frame_indices(trajectory.time, FRAMES_A_SECOND)
     nearest = np.searchsorted(0.5 * (pose.time[:-1] + pose.time[1:]), trajectory.recorded_time[frames])
@@ -150,22 +128,16 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     floor_z = find_floor(model)
     root = R_WB, p_WB = place_beside_person(robot, shoulder_z, floor_z)
     placed |= {f"robot {joint}": at for joint, at in compute_placements(trajectory, parts, frames, *root).items()}
-    meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
-    for side, at in compute_target_placements(trajectory, frames, *root).items():
-        placed[f"target {side}"] = at
-        hand = next(robot.model.frames[arm.hand].parentJoint for arm in robot.arms if arm.side == side)
-        own = [part for part in parts if part.joint == hand]
-        meshes += [Mesh(f"target {side}", p.vertices, p.triangles, (*p.rgba[:3], GHOST_OPACITY)) for p in own]
     trails = {}  # short names: heads are beside them
     for side, arm in arms.items():
         colour = choose_trail_colour(arm.tip, model)
-        trails[side] = Trail(pose.points[arm.tip][nearest], colour)
-        trails[f"{side}_robot"] = Trail(trajectory.hand[side][frames] @ R_WB.T + p_WB, colour)
+        trails[side] = pose.points[arm.tip][nearest], colour
+        trails[f"{side}_robot"] = trajectory.hand[side][frames] @ R_WB.T + p_WB, colour
     return view_html(
         visuals,
         trajectory.time[frames],
         placed,
-        meshes=meshes,
+        meshes=parts,
         trails=trails,
         phases={"approach": [(0.0, float(trajectory.time[trajectory.approach_samples]))]},
         title=title,
@@ -178,8 +150,8 @@ def view_html(
     time: np.ndarray,
     placements: Mapping[str, tuple[np.ndarray, np.ndarray]],
     *,
-    meshes: Sequence[Mesh] = (),
-    trails: Mapping[str, Trail] = MappingProxyType({}),
+    meshes: Sequence[MeshPart] = (),
+    trails: Trails = MappingProxyType({}),
     angles: Mapping[str, np.ndarray] = MappingProxyType({}),
     phases: Phases = MappingProxyType({}),
     title: str = "",
@@ -191,14 +163,14 @@ def view_html(
 
     Parameters
     ----------
-    visuals : shapes of the body; a link without a placement is not drawn, nor is a visual of kind ``"mesh"``
+    visuals : shapes of the body; a link without a placement is not drawn
     time : (n,) [s], n >= 1, rising
     placements : link → (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]); a link is hidden while its placement is NaN
     trails, angles : point → its way; name → (n,) [deg], shown beside the body
     floor_z : height [m] of the ground grid in W
     """
     time = np.asarray(time, dtype=float)
-    drawn = visible(visual for visual in visuals if visual.link in placements)
+    drawn = [visual for visual in visuals if visual.link in placements]
     meshes = [mesh for mesh in meshes if mesh.link in placements]
     links = list(dict.fromkeys([*(v.link for v in drawn), *(mesh.link for mesh in meshes)]))
     motion = np.empty((len(links), len(time), 7), dtype="<f4")  # quat_WL xyzw, p_WL
@@ -210,24 +182,19 @@ def view_html(
         "offsets": _base64(time - time[0]),  # float32 holds an offset, not seconds since 1970
         "links": links,
         "motion": _base64(motion),
-        "trails": [{"name": name, "colour": t.colour, "points": _base64(t.points)} for name, t in trails.items()],
+        "trails": [{"name": name, "colour": colour, "points": _base64(way)} for name, (way, colour) in trails.items()],
         "angles": [{"name": name, "values": _base64(values)} for name, values in angles.items()],
         "phases": [{"name": name, "spans": [[*map(float, span)] for span in each]} for name, each in phases.items()],
-        "view": view([*drawn, *map(_find_box, meshes)], links, motion, [trail.points for trail in trails.values()]),
+        "view": view([*drawn, *map(_find_box, meshes)], links, motion, [way for way, _ in trails.values()]),
         "scene": scene(drawn, links, meshes),
-        "backdrop": backdrop(LIGHT, floor_z),
+        "backdrop": {**LIGHT, "floor": floor_z},
     }
-    return filled("report/templates/view.html.j2", data, title)
+    return fill_page("report/templates/view.html.j2", data, title)
 
 
-def filled(template: str, data: Mapping[str, Any], title: str) -> str:
+def fill_page(template: str, data: Mapping[str, Any], title: str) -> str:
     """A page of a template with the viewer in it, of its data and title."""
     return load_template(template).render(title=title, data=data, meshcat=_meshcat_source())
-
-
-def visible(visuals: Iterable[Visual]) -> list[Visual]:
-    """The visuals that can be drawn."""
-    return [visual for visual in visuals if visual.kind != "mesh"]
 
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
@@ -237,7 +204,7 @@ def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     return np.unique(np.searchsorted(nearest_changes, clock))
 
 
-def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] = ()) -> dict[str, Any]:
+def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[MeshPart] = ()) -> dict[str, Any]:
     """Lights, camera and body as static/viewer.js builds them; a part's link is its place in `links`."""
     parts = [
         {
@@ -263,12 +230,7 @@ def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] 
     return {"fov_deg": FIELD_OF_VIEW_DEG, "lights": lights, "parts": parts, "meshes": solids}
 
 
-def backdrop(colours: Mapping[str, tuple[float, float, float]], floor_z: float = FLOOR_Z) -> dict[str, Any]:
-    """Background and ground grid as static/viewer.js builds them."""
-    return {**colours, "floor": floor_z}
-
-
-def _find_box(mesh: Mesh) -> Visual:
+def _find_box(mesh: MeshPart) -> Visual:
     """The box around a mesh, for the camera."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     return Visual(mesh.link, "box", tuple(high - low), np.array([0.0, 0.0, 0.0, 1.0]), 0.5 * (low + high), mesh.rgba)
@@ -281,10 +243,8 @@ def view(
 
     A visual counts as the ball around it.
     """
-    k = np.arange(DIRECTIONS) + 0.5  # evenly over the sphere
-    height, angle = 1.0 - 2.0 * k / DIRECTIONS, k * np.pi * (1.0 + 5.0**0.5)
-    directions = np.vstack([np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1.0 - height**2), height])
-    directions = np.hstack([directions, np.eye(3), -np.eye(3)])
+    directions = np.array([*product((-1.0, -0.4, 0.4, 1.0), repeat=3), *np.eye(3), *-np.eye(3)]).T
+    directions /= np.linalg.norm(directions, axis=0)
     balls_W = [(np.zeros((1, 3)), 0.0), *((trail[:: max(1, len(trail) // (4 * MOST_POSES))], 0.0) for trail in trails)]
     for visual in visuals:
         placed = motion[links.index(visual.link), :: max(1, motion.shape[1] // MOST_POSES)].astype(float)

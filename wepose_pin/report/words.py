@@ -15,7 +15,7 @@ class Table(NamedTuple):
     """A table; a cell may hold `code` and **bold**."""
 
     title: str
-    header: Sequence[str]  # empty: names and values
+    header: Sequence[str]
     rows: Sequence[Sequence[str]]
 
     @property

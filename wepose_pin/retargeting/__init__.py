@@ -6,10 +6,10 @@ coordinates in T to B. `u` holds the values of the joints of the arms, `q` is Pi
 
 from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisions
 from .controller import ControllerParams
-from .files import build_table, find_missed_targets, summarize, write_trajectory
+from .files import build_table, summarize, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_joint_limits, read_map
-from .robot import LimitMargins, Robot, load_robot
-from .stream import ArmObserver, Command, CommandStream, StreamOptions
+from .robot import Robot, load_robot
+from .stream import ArmObserver, Command, CommandStream
 from .targets import ArmTargets, compute_arm_targets
 from .trajectory import Trajectory, retarget
 
@@ -21,17 +21,14 @@ __all__ = [
     "CommandStream",
     "ControllerParams",
     "LimitCheck",
-    "LimitMargins",
     "Robot",
     "RobotMap",
     "SelfCollisions",
-    "StreamOptions",
     "Trajectory",
     "build_table",
     "check_limits",
     "compute_arm_targets",
     "find_map",
-    "find_missed_targets",
     "find_self_collisions",
     "load_robot",
     "read_joint_limits",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -40,43 +40,35 @@ def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
     joint is at its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before;
     none of these: position, orientation and swivel cannot be met together.
     """
-    robot, run = trajectory.robot, trajectory.run
+    robot, report = trajectory.robot, trajectory.report
     joints, target = robot.arms[arm].joints, trajectory.targets[arm]
-    u = run.joint_position[:, joints]
+    u = trajectory.joint_position[:, joints]
     at_limit = (u - robot.lower[joints] < AT_LIMIT) | (robot.upper[joints] - u < AT_LIMIT)
-    active, half = run.report.limited[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
+    active, half = report.limited[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
     applies = [
         target.lost,
         np.linalg.norm(target.position - target.unclamped, axis=1) > CLAMPED,
-        run.report.near_contact[:, joints].any(axis=1),
+        report.near_contact[:, joints].any(axis=1),
         (active & at_limit).any(axis=1),
         maximum_filter1d(active.any(axis=1), 2 * half + 1, origin=half),
         np.ones(len(u), dtype=bool),
     ]
-    far = np.linalg.norm(run.hand[arm] - target.unclamped, axis=1) > FAR
+    far = np.linalg.norm(trajectory.p_BH[arm] - target.unclamped, axis=1) > FAR
     return np.where(far, np.argmax(applies, axis=0), -1)
 
 
-class MissedTarget(NamedTuple):
-    """A time in which a hand stays off its target."""
+def _find_missed_targets(trajectory: Trajectory, i: int) -> list[tuple[tuple[float, float], float]]:
+    """Return the times [s] of the recording in which a hand is off by more than `LOST_M` for longer than `LOST_S`.
 
-    side: str
-    span: tuple[float, float]  # [s] of the recording
-    error: float  # [m] largest
-
-
-def find_missed_targets(trajectory: Trajectory) -> list[MissedTarget]:
-    """Return when a hand is off by more than `LOST_M` for longer than `LOST_S`."""
-    missed, least = [], round(LOST_S / float(trajectory.time[1]))
-    for arm, target, hand in zip(trajectory.robot.arms, trajectory.targets, trajectory.run.hand, strict=True):
-        distance = np.linalg.norm(hand - target.position, axis=1)
-        lost = (distance > LOST_M) & (target.weight >= MIN_WEIGHT) & ~target.lost
-        lost[: trajectory.approach_samples] = False
-        for first, end in find_runs(lost) if trajectory.params.position else ():
-            if end - first >= least:
-                begin_s, end_s = trajectory.recorded_time[[first, end - 1]].tolist()
-                missed.append(MissedTarget(arm.side, (begin_s, end_s), float(distance[first:end].max())))
-    return missed
+    With each, the largest error [m].
+    """
+    target, least = trajectory.targets[i], round(LOST_S / float(trajectory.time[1]))
+    distance = np.linalg.norm(trajectory.p_BH[i] - target.position, axis=1)
+    lost = (distance > LOST_M) & (target.weight >= MIN_WEIGHT) & ~target.lost & (trajectory.params.position > 0.0)
+    lost[: trajectory.approach_samples] = False
+    runs = [(first, end) for first, end in find_runs(lost) if end - first >= least]
+    times = trajectory.recorded_time
+    return [((float(times[a]), float(times[b - 1])), float(distance[a:b].max())) for a, b in runs]
 
 
 def diagnose_trajectory(
@@ -97,29 +89,27 @@ def diagnose_trajectory(
         diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
     if not collisions.pairs:
         diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name))
-    missed = find_missed_targets(trajectory)
-    for side in dict.fromkeys(target.side for target in missed):
-        own = [target for target in missed if target.side == side]
-        moments = ", ".join(format_span(target.span) for target in own[:MAX_MOMENTS])
-        error = max(target.error for target in own)
-        diagnostics.append(Diagnostic("robot-hand-off-target", WARNING, side, error, LOST_M, {"moments": moments}))
-    if (limiting := trajectory.limiting_joint) is not None and slowdown is not None:
-        about: dict[str, float | str] = {"joint": limiting.joint, "quantity": limiting.quantity}
-        about["moment"] = limiting.time
+    for i, arm in enumerate(trajectory.robot.arms):
+        if missed := _find_missed_targets(trajectory, i):
+            facts = {"moments": ", ".join(format_span(span) for span, _ in missed[:MAX_MOMENTS])}
+            error = max(error for _, error in missed)
+            diagnostics.append(Diagnostic("robot-hand-off-target", WARNING, arm.side, error, LOST_M, facts))
+    if (slowest := trajectory.slowest) is not None and slowdown is not None:
+        about = {"joint": slowest["joint"], "quantity": slowest["quantity"], "moment": slowest["time"]}
         diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=about))
-    if stopping := int(trajectory.run.report.stopping.sum()):
+    if stopping := int(trajectory.report.stopping.sum()):
         diagnostics.append(Diagnostic("robot-stopped-for-clearance", WARNING, name, stopping))
     return diagnostics
 
 
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
     """Contents of ``summary.json``."""
-    robot, run, limiting = trajectory.robot, trajectory.run, trajectory.limiting_joint
+    robot, report = trajectory.robot, trajectory.report
     begin = trajectory.approach_samples
     recorded_s = float(trajectory.recorded_time[-1] - trajectory.recorded_time[begin])
     shown_s = float(trajectory.time[np.argmax(trajectory.recorded_time)] - trajectory.time[begin])
     slowdown = round(shown_s / recorded_s, 3) if recorded_s else None
-    nearest = float(run.report.hull_distance.min())
+    nearest = float(report.hull_distance.min())
     R_WB, p_WB = place_root(robot)
     root = (*p_WB.tolist(), *Rotation.from_matrix(R_WB).as_quat().tolist())
     return {
@@ -134,7 +124,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "approach_s": round(float(trajectory.time[begin]), 3),
         "recorded_s": round(recorded_s, 3),
         "slowdown": slowdown,
-        "slowest": None if limiting is None else limiting._asdict(),
+        "slowest": trajectory.slowest,
         "arms": {arm.side: _summarize_arm(trajectory, i) for i, arm in enumerate(robot.arms)},
         "within_limits": limits.passed,
         "limit_margins": {
@@ -149,25 +139,25 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "pairs": collisions.pairs,
             "min_hull_distance_mm": round(1e3 * nearest, 1) if np.isfinite(nearest) else None,
         },
-        "steps": {"stopping_share": _share(run.report.stopping)},
+        "steps": {"stopping_share": _share(report.stopping)},
         "diagnostics": [as_json(each) for each in diagnose_trajectory(trajectory, limits, collisions, slowdown)],
     }
 
 
 def _summarize_arm(trajectory: Trajectory, i: int) -> dict[str, Any]:
     """Errors of one arm after the approach."""
-    arm, target, run = trajectory.robot.arms[i], trajectory.targets[i], trajectory.run
+    arm, target = trajectory.robot.arms[i], trajectory.targets[i]
     moving = slice(trajectory.approach_samples, None)
     inside = np.linalg.norm(target.position - target.unclamped, axis=1)[moving] < CLAMPED
-    far = 1e3 * np.linalg.norm(run.hand[i] - target.unclamped, axis=1)[moving]
-    turn = Rotation.from_matrix(run.rotation[i, moving]).inv() * Rotation.from_matrix(target.rotation[moving])
-    swivels = run.swivel[i, moving], target.swivel[moving]
+    far = 1e3 * np.linalg.norm(trajectory.p_BH[i] - target.unclamped, axis=1)[moving]
+    turn = Rotation.from_matrix(trajectory.R_BH[i, moving]).inv() * Rotation.from_matrix(target.rotation[moving])
+    swivels = trajectory.swivel[i, moving], target.swivel[moving]
     sizes = [np.linalg.norm(swivel, axis=1) for swivel in swivels]
     flexed = np.min(sizes, axis=0) > MIN_SWIVEL
     cosine = np.sum(swivels[0] * swivels[1], axis=1)[flexed] / (sizes[0] * sizes[1])[flexed]
     cause = find_error_causes(trajectory, i)[moving]
     return {
-        "scale": round(trajectory.arm_targets.scale[arm.side], 4),
+        "scale": round(trajectory.scale[arm.side], 4),
         "inside_reach_share": _share(inside),
         "hand_error_mm": _quantiles(far[inside]),
         "hand_error_everywhere_mm": _quantiles(far),
@@ -189,13 +179,12 @@ def _share(mask: np.ndarray) -> float:
 
 def build_table(trajectory: Trajectory) -> pl.DataFrame:
     """``time``, ``recorded_time`` [s]; then each joint's position, ``_velocity`` and ``_acceleration``."""
-    run = trajectory.run
     columns: dict[str, np.ndarray] = {"time": trajectory.time, "recorded_time": trajectory.recorded_time}
     for j, name in enumerate(trajectory.robot.names):
         columns |= {
-            name: run.joint_position[:, j],
-            f"{name}_velocity": run.joint_velocity[:, j],
-            f"{name}_acceleration": run.joint_acceleration[:, j],
+            name: trajectory.joint_position[:, j],
+            f"{name}_velocity": trajectory.joint_velocity[:, j],
+            f"{name}_acceleration": trajectory.joint_acceleration[:, j],
         }
     return pl.DataFrame(columns)
 
@@ -212,13 +201,13 @@ def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
 
 def _format_joint_trajectory(trajectory: Trajectory) -> str:
     """ROS 2's trajectory_msgs/msg/JointTrajectory, a line a point."""
-    run, points = trajectory.run, []
+    points = []
     for k, time in enumerate(trajectory.time.tolist()):
         seconds, nanoseconds = divmod(round(1e9 * time), 10**9)
         point = {
-            "positions": np.round(run.joint_position[k], DIGITS).tolist(),
-            "velocities": np.round(run.joint_velocity[k], DIGITS).tolist(),
-            "accelerations": np.round(run.joint_acceleration[k], DIGITS).tolist(),
+            "positions": np.round(trajectory.joint_position[k], DIGITS).tolist(),
+            "velocities": np.round(trajectory.joint_velocity[k], DIGITS).tolist(),
+            "accelerations": np.round(trajectory.joint_acceleration[k], DIGITS).tolist(),
             "effort": [],
             "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
         }

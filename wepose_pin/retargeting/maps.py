@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
 from ..libraries import asset
 
-ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1", "alex")
+ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 MAX_VALUE = 1e6  # of a number in a map
@@ -70,13 +69,6 @@ class HandPoint(NamedTuple):
     offset: Annotated[tuple[float, float, float], Key("offset", "m")] = (0.0, 0.0, 0.0)
 
 
-class Origin(NamedTuple):
-    """Where the shape of a link is on it."""
-
-    xyz: Annotated[tuple[float, float, float], Key("xyz", "m")] = (0.0, 0.0, 0.0)
-    rpy: Annotated[tuple[float, float, float], Key("rpy", "rad")] = (0.0, 0.0, 0.0)
-
-
 class ArmMap(NamedTuple):
     """One arm of the robot: the keys of ``arms.SIDE``."""
 
@@ -87,44 +79,32 @@ class ArmMap(NamedTuple):
     reach: Annotated[float | None, Key("reach", "", 1e-3)] = None
 
 
-class _Keys(NamedTuple):
-    """The keys of a map, but for its format and ``limits``."""
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
-    urdf: str
+
+class RobotMap(NamedTuple):
+    """What retargeting needs of a robot beyond its URDF: the keys of its map, as docs/robot-maps.md has them.
+
+    `description` has the source of the limits too.
+    """
+
+    urdf_file: Annotated[str, Key("urdf")]  # as it stands in the map, as is `srdf_file`
     up: Annotated[str, Key(of="axes")]
     forward: Annotated[str, Key(of="axes")]
     arms: Mapping[str, ArmMap]
-    srdf: str = ""
+    srdf_file: Annotated[str, Key("srdf")] = ""
     base: str = ""
     description: str = ""
     table: float | None = None
-    rest: Mapping[str, float] = MappingProxyType({})
-    collision: Mapping[str, Origin] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class RobotMap:
-    """What retargeting needs of a robot beyond its URDF: the keys of its map, as docs/robot-maps.md has them.
-
-    `where` is the file's name, for error messages; `description` has the source of the limits too.
-    """
-
-    name: str
-    where: str
-    urdf: Path
-    srdf: Path | None
-    base: str
-    up: str
-    forward: str
-    rest: Mapping[str, float]
-    acceleration: Mapping[str, float]
-    jerk: Mapping[str, float]
-    velocity: Mapping[str, float]
-    position: Mapping[str, tuple[float, ...]]
-    arms: Mapping[str, ArmMap]
-    table: float | None = None
-    description: str = ""
-    collision: Mapping[str, Origin] = field(default_factory=dict)
+    rest: Mapping[str, float] = _NOTHING
+    name: Annotated[str, None] = ""
+    where: Annotated[str, None] = ""  # the file's name, for error messages
+    urdf: Annotated[Path, None] = Path()
+    srdf: Annotated[Path | None, None] = None
+    acceleration: Annotated[Mapping[str, float], None] = _NOTHING
+    jerk: Annotated[Mapping[str, float], None] = _NOTHING
+    velocity: Annotated[Mapping[str, float], None] = _NOTHING
+    position: Annotated[Mapping[str, tuple[float, ...]], None] = _NOTHING
 
     def read_joint_limits(self) -> dict[str, JointLimit]:
         """Return the limits of every movable joint: those of the map, else the URDF's.
@@ -178,36 +158,33 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     top = TomlTable(read_toml(path, "a robot's map (docs/robot-maps.md)", BadModel), path.name, error=BadModel)
     if top.values.get("format") != 1:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
-    keys = read_record(_Keys, top, {"axes": AXES}, others=("format", "limits"))
+    robot = read_record(RobotMap, top, {"axes": AXES}, others=("format", "limits"))
     _check_axes(top, "up", "forward")
     arms = top.table("arms")
     arms.allow(*SIDES)
     sides = {side: arms.table(side) for side in arms.values}
-    if not keys.arms:
+    if not robot.arms:
         raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
-    for side, arm in keys.arms.items():
+    for side, arm in robot.arms.items():
         _check_axes(sides[side].table("hand"), "fingers", "thumb")
         if not arm.joints:
             raise BadModel(f"{sides[side].at('joints')}: a list of joints from the shoulder to the hand is needed")
     limits = top.table("limits", {})
     limits.allow("source", "acceleration", "jerk", "velocity", "position")
-    joints = [name for arm in keys.arms.values() for name in arm.joints]
+    joints = [name for arm in robot.arms.values() for name in arm.joints]
     acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
-    return RobotMap(
-        **keys._asdict()
-        | {
-            "name": path.stem,
-            "where": path.name,
-            "urdf": urdf or _find_file(path, top, "urdf"),
-            "srdf": _find_file(path, top, "srdf") if keys.srdf else None,
-            "arms": {side: keys.arms[side] for side in SIDES if side in keys.arms},
-            "description": " ".join(filter(None, (keys.description, limits.text("source", None)))),
-            "acceleration": acceleration,
-            "jerk": jerk | _read_joint_values(limits, "jerk", joints),
-            "velocity": _read_joint_values(limits, "velocity", joints),
-            "position": _read_ranges(limits.table("position", {})),
-        }
+    return robot._replace(
+        name=path.stem,
+        where=path.name,
+        urdf=urdf or _find_file(path, top, "urdf"),
+        srdf=_find_file(path, top, "srdf") if robot.srdf_file else None,
+        arms={side: robot.arms[side] for side in SIDES if side in robot.arms},
+        description=" ".join(filter(None, (robot.description, limits.text("source", None)))),
+        acceleration=acceleration,
+        jerk=jerk | _read_joint_values(limits, "jerk", joints),
+        velocity=_read_joint_values(limits, "velocity", joints),
+        position=_read_ranges(limits.table("position", {})),
     )
 
 

@@ -26,20 +26,6 @@ _REACH_STARTS = 8
 
 
 @dataclass(frozen=True)
-class LimitMargins:
-    """What a robot leaves of its limits."""
-
-    speed_scale: float = 0.9  # share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1
-    limit_margin: float = 0.05  # [rad] to each position limit; of a joint that slides a tenth of it in metres
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.speed_scale <= 1.0:
-            raise WrongOption("speed-scale", f"{self.speed_scale:g}", "above 0, up to 1, the robot's full limits")
-        if not 0.0 <= self.limit_margin < np.pi:
-            raise WrongOption("limit-margin", f"{self.limit_margin:g}", "radians, at least 0, are needed")
-
-
-@dataclass(frozen=True)
 class Arm:
     """One arm of the reduced model."""
 
@@ -60,7 +46,7 @@ class Robot:
     full: Any  # Pinocchio's model of the whole robot
     model: Any  # and of its arms' joints only
     geometry: Any  # collision geometry on `model`
-    lower: np.ndarray  # (n,) limits [rad or m, s], these five, inside those of URDF and map by `margins`
+    lower: np.ndarray  # (n,) limits [rad or m, s], these five, inside those of URDF and map
     upper: np.ndarray
     v_max: np.ndarray
     a_max: np.ndarray
@@ -69,7 +55,8 @@ class Robot:
     rest_full: np.ndarray  # the same as a configuration of `full`
     R_BT: np.ndarray  # maps coordinates in the person's torso to B
     arms: tuple[Arm, ...]
-    margins: LimitMargins
+    speed_scale: float  # share of the limits of velocity, acceleration and jerk that is used
+    limit_margin: float  # [rad] to each position limit; of a joint that slides a tenth of it in metres
 
     def configuration(self, u: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration `q` of `model`: a continuous joint has cosine and sine there."""
@@ -102,16 +89,21 @@ class Robot:
         return np.clip(self.lower, -np.pi, np.pi), np.clip(self.upper, -np.pi, np.pi)
 
 
-def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: LimitMargins | None = None) -> Robot:
-    """Build the robot of a map, with the arms of `sides`; None: all arms of the map, the default margins.
+def load_robot(
+    robot: RobotMap, sides: tuple[str, ...] | None = None, speed_scale: float = 0.9, limit_margin: float = 0.05
+) -> Robot:
+    """Build the robot of a map, with the arms of `sides`, None: all; the other parameters are those of `retarget`.
 
     Raises
     ------
     MissingFile, BadModel, WrongOption
-        A file, link or joint that does not exist; a joint without limits, or with a range that the margins use up; an
+        A file, link or joint that does not exist; a joint without limits, or with a range that the margin uses up; an
         arm that the robot does not have.
     """
-    margins = margins or LimitMargins()
+    if not 0.0 < speed_scale <= 1.0:
+        raise WrongOption("speed-scale", f"{speed_scale:g}", "above 0, up to 1, the robot's full limits")
+    if not 0.0 <= limit_margin < np.pi:
+        raise WrongOption("limit-margin", f"{limit_margin:g}", "radians, at least 0, are needed")
     for side in sides or ():
         if side not in robot.arms:
             raise WrongOption("arm", side, f"{robot.name} has no {side} arm; {one_of(robot.arms)}")
@@ -142,13 +134,12 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
     locked = [full.getJointId(name) for name in full.names[1:] if name not in joints]
     model, geometry = pin.buildReducedModel(full, geometry, locked, rest_full)
     names = tuple(model.names[1:])
-    lower, upper = np.array([_narrow_range(name, limits[name], margins) for name in names]).T
+    lower, upper = np.array([_narrow_range(name, limits[name], limit_margin) for name in names]).T
     largest = [(limits[name].velocity, robot.acceleration[name], robot.jerk[name]) for name in names]
-    v_max, a_max, j_max = min(margins.speed_scale, MAX_SPEED_SCALE) * np.array(largest).T
+    v_max, a_max, j_max = min(speed_scale, MAX_SPEED_SCALE) * np.array(largest).T
     rest = np.clip([robot.rest.get(name, 0.0) for name in names], lower + REST_MARGIN, upper - REST_MARGIN)
-    built = Robot(
-        robot, names, full, model, geometry, lower, upper, v_max, a_max, j_max, rest, rest_full, R_BT, (), margins
-    )  # fmt: skip
+    limited = lower, upper, v_max, a_max, j_max
+    built = Robot(robot, names, full, model, geometry, *limited, rest, rest_full, R_BT, (), speed_scale, limit_margin)
     return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
 
 
@@ -166,14 +157,11 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
             joint = full.parents[joint]
         for name in arm.joints:
             robot.check_name(where, "moving joint", name, limits)
-            mimic = limits[name].mimic
-            problems = [f"does not move the hand's link '{arm.hand.link}'"] * (name not in chain)
-            problems += [f"copies '{mimic[0]}'"] if mimic is not None else []
-            problems += [
-                f"is copied by '{other}'" for other, limit in limits.items() if (limit.mimic or ("",))[0] == name
-            ]
-            if problems:
-                text = f"'{name}' is no joint of the arm: it {problems[0]}"
+            mimics = {joint: limit.mimic[0] for joint, limit in limits.items() if limit.mimic is not None}
+            if name not in chain or name in mimics or name in mimics.values():
+                copies = f"copies '{mimics[name]}'" if name in mimics else "is copied by another joint"
+                state = copies if name in chain else f"does not move the hand's link '{arm.hand.link}'"
+                text = f"'{name}' is no joint of the arm: it {state}"
                 raise BadModel(f"{robot.where}: {where}: {text}; leave it out, it stays where `rest` has it")
             _check_limits(robot, name, limits[name])
     for name in robot.rest:
@@ -214,33 +202,23 @@ def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, Join
 
 
 def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
-    """Pinocchio's geometry model, placed as the map has it; empty where the URDF has no collision shapes."""
+    """Pinocchio's geometry model; empty where the URDF has no collision shapes."""
     try:
-        geometry = pin.buildGeomFromUrdf(
+        return pin.buildGeomFromUrdf(
             full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=package_folders(robot.urdf)
         )
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {reason(error)}") from error
-    for link, (xyz, rpy) in robot.collision.items():
-        own = [shape for shape in geometry.geometryObjects if shape.name.rpartition("_")[0] == link]
-        if len(own) != 1:
-            raise BadModel(
-                f"{robot.where}: collision.{link}: the link has {len(own)} collision shapes in {robot.urdf.name}, "
-                "one is needed"
-            )
-        origin = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
-        own[0].placement = full.frames[full.getFrameId(link)].placement * origin
-    return geometry
 
 
-def _narrow_range(name: str, limit: JointLimit, margins: LimitMargins) -> tuple[float, float]:
-    """Return the position limits of a joint, less its margins [rad or m]."""
+def _narrow_range(name: str, limit: JointLimit, limit_margin: float) -> tuple[float, float]:
+    """Return the position limits of a joint, less its margin [rad or m]."""
     scale = SLIDE_M_PER_RAD if limit.kind == "prismatic" else 1.0
-    margin = max(scale * margins.limit_margin, MIN_LIMIT_MARGIN)
+    margin = max(scale * limit_margin, MIN_LIMIT_MARGIN)
     lower, upper = limit.lower + margin, limit.upper - margin
     if upper - lower < 2.0 * REST_MARGIN:
         text = f"joint '{name}' moves from {limit.lower:g} to {limit.upper:g} only"
-        raise WrongOption("limit-margin", f"{margins.limit_margin:g}", text)
+        raise WrongOption("limit-margin", f"{limit_margin:g}", text)
     return lower, upper
 
 

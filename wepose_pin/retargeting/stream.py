@@ -234,32 +234,26 @@ class ArmObserver:
         return math.sqrt(variance / 3.0)
 
 
-@dataclass(frozen=True)
-class StreamOptions:
-    """Timing of a `CommandStream`."""
-
-    rate_hz: float = 100.0  # commands a second
-    hold_after: float = HOLD_AFTER_S  # [s] without a pose, after which the robot brakes
-    stop_after: float = STOP_AFTER_S  # [s] without a pose, after which it stops until `resume`
-
-    def __post_init__(self) -> None:
-        if not 10.0 <= self.rate_hz <= 1000.0:
-            raise WrongOption("rate-hz", f"{self.rate_hz:g}", "from 10 to 1000 commands a second")
-        if not 0.0 < self.hold_after < self.stop_after < np.inf:
-            needed = f"seconds, above 0 and less than stop_after = {self.stop_after:g}"
-            raise WrongOption("hold-after", f"{self.hold_after:g}", needed)
-
-
 class CommandStream:
-    """Commands at a constant rate for a robot that follows a live pose.
+    """`rate_hz` commands a second for a robot that follows a live pose.
 
-    It begins at rest in the robot's rest posture. Without a pose for `hold_after` it brakes, and continues when one
-    comes; without one for `stop_after` it stops until `resume`.
+    It begins at rest in the robot's rest posture. Without a pose for `hold_after` [s] it brakes, and continues when one
+    comes; without one for `stop_after` [s] it stops until `resume`.
     """
 
-    def __init__(self, robot: Robot, options: StreamOptions | None = None) -> None:
-        self.robot, self.options = robot, options or StreamOptions()
-        self.dt = 1.0 / self.options.rate_hz
+    def __init__(
+        self,
+        robot: Robot,
+        rate_hz: float = 100.0,
+        hold_after: float = HOLD_AFTER_S,
+        stop_after: float = STOP_AFTER_S,
+    ) -> None:
+        if not 10.0 <= rate_hz <= 1000.0:
+            raise WrongOption("rate-hz", f"{rate_hz:g}", "from 10 to 1000 commands a second")
+        if not 0.0 < hold_after < stop_after < np.inf:
+            needed = f"seconds, above 0 and less than stop_after = {stop_after:g}"
+            raise WrongOption("hold-after", f"{hold_after:g}", needed)
+        self.robot, self.dt, self.hold_after, self.stop_after = robot, 1.0 / rate_hz, hold_after, stop_after
         self._omega = 2.0 * np.pi * SMOOTHING_HZ
         collision = CollisionModel(robot)
         self._controller = QpController(robot, collision, self.dt)
@@ -292,7 +286,7 @@ class CommandStream:
             return False
         dt, before = time - self._time, self._observed
         self._time, self._observed = time, observed
-        continues = bool(before) and 0.0 < dt <= self.options.hold_after
+        continues = bool(before) and 0.0 < dt <= self.hold_after
         if continues and not _jumps(before, observed, dt):
             for low_pass, observation in zip(self._low_passes, observed, strict=True):
                 low_pass.push(observation.motion, dt, self._omega)
@@ -304,15 +298,14 @@ class CommandStream:
 
     def step(self, now: float, age: float) -> Command:
         """The next command; `now` [s] on the poses' clock, `age` [s] since a pose came."""
-        hold_after, stop_after = self.options.hold_after, self.options.stop_after
-        if self._observed and age > stop_after and not self._stop_reason:
-            self._stop_reason = f"no sound pose for {stop_after:g} s"
+        if self._observed and age > self.stop_after and not self._stop_reason:
+            self._stop_reason = f"no sound pose for {self.stop_after:g} s"
         if self._end_reason or self._stop_reason:
             return self._brake_to_rest(self._end_reason or self._stop_reason, final=True)
         if not self._observed:
             return self._brake_to_rest(WAITING)
-        if age > hold_after:
-            return self._brake_to_rest(f"no sound pose for {hold_after:g} s")
+        if age > self.hold_after:
+            return self._brake_to_rest(f"no sound pose for {self.hold_after:g} s")
         return self._follow(now)
 
     def end(self, reason: str) -> None:

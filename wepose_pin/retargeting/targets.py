@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline, interp1d
@@ -31,34 +31,23 @@ LINKS = 3  # of an arm: upper arm, forearm, hand
 
 
 class HandTarget(NamedTuple):
-    """Target of one hand in B, at one moment or over time (n, …)."""
+    """Target of one hand in B, at one moment, or over time with (n, …) in each field."""
 
     position: np.ndarray  # (3,) [m], inside the reach
     velocity: np.ndarray  # (3,) [m/s]
     rotation: np.ndarray  # (3, 3)
     angular_velocity: np.ndarray  # (3,) [rad/s]
     swivel: np.ndarray  # (3,) [m] elbow swivel direction: perpendicular from the line shoulder-hand to the elbow
-    weight: np.ndarray | float  # 0 to 1, from the uncertainty of the hand
+    weight: Any  # 0 to 1, from the uncertainty of the hand
+    unclamped: Any = None  # (3,) [m] position before it was clamped to the reach; these two only over time
+    lost: Any = None  # whether it was not measured, but bridged
 
-    def sample(self, k: int) -> HandTarget:
-        """Return the target at sample `k`."""
-        return HandTarget(*(values[k] for values in self))  # type: ignore[index]
+    def sample(self, k: Any) -> HandTarget:
+        """Return the target at sample `k`, or at several."""
+        return HandTarget(*(values[k] for values in self))
 
-
-class HandPath(NamedTuple):
-    """Target of one hand over time, in B; the first fields as in `HandTarget`."""
-
-    position: np.ndarray  # (n, 3)
-    velocity: np.ndarray  # (n, 3)
-    rotation: np.ndarray  # (n, 3, 3)
-    angular_velocity: np.ndarray  # (n, 3)
-    swivel: np.ndarray  # (n, 3)
-    weight: np.ndarray  # (n,)
-    unclamped: np.ndarray  # (n, 3) [m] position before it was clamped to the reach
-    lost: np.ndarray  # (n,) bool: not measured, bridged
-
-    def differentiate(self, clock: np.ndarray) -> HandPath:
-        """Return the path with the velocities of its positions and rotations on `clock` [s]."""
+    def differentiate(self, clock: np.ndarray) -> HandTarget:
+        """Return the target over time with the velocities of its positions and rotations on `clock` [s]."""
         R = Rotation.from_matrix(self.rotation)
         between = (R[1:] * R[:-1].inv()).as_rotvec() / np.diff(clock)[:, None]
         angular_velocity = np.vstack([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
@@ -73,7 +62,7 @@ class HandPath(NamedTuple):
             0.5 * (rate[following] + rate[after]) for rate in (self.velocity, self.angular_velocity)
         )
         position = self.position + 0.5 * dt * self.velocity
-        return HandTarget(position, velocity, self.rotation, angular_velocity, self.swivel, self.weight)
+        return self._replace(position=position, velocity=velocity, angular_velocity=angular_velocity)
 
 
 @dataclass(frozen=True)
@@ -81,7 +70,7 @@ class ArmTargets:
     """Motion of the person's arms in B."""
 
     time: np.ndarray  # (n,) [s] of the recording
-    hands: tuple[HandPath, ...]  # one path an arm, in the order of `Robot.arms`
+    hands: tuple[HandTarget, ...]  # over time, one an arm, in the order of `Robot.arms`
     slowdown: np.ndarray  # (n,) from 1: factor on the duration that poor tracking asks for
     scale: dict[str, float]  # side → metres of the robot for one metre of the person
 
@@ -96,14 +85,14 @@ class ArmTargets:
             rotation = Slerp(time, Rotation.from_matrix(hand.rotation))(inside).as_matrix()
             weight = np.interp(moments, time, hand.weight)
             lost = np.interp(moments, time, hand.lost.astype(float)) > 0.5
-            path = HandPath(position, position, rotation, position, swivel, weight, unclamped, lost)
+            path = HandTarget(position, position, rotation, position, swivel, weight, unclamped, lost)
             hands.append(path.differentiate(clock))
         return replace(self, time=moments, hands=tuple(hands), slowdown=np.interp(moments, time, self.slowdown))
 
     def select(self, samples: np.ndarray, dt: float) -> ArmTargets:
         """Return some samples (m,) int as a motion of their own, `dt` [s] apart."""
         clock = np.arange(len(samples)) * dt
-        hands = (HandPath(*(values[samples] for values in hand)).differentiate(clock) for hand in self.hands)
+        hands = (hand.sample(samples).differentiate(clock) for hand in self.hands)
         return replace(self, time=self.time[samples], hands=tuple(hands), slowdown=self.slowdown[samples])
 
 
@@ -149,23 +138,18 @@ def check_person_arms(
     robot: Robot, segments: Collection[str], points: Collection[str] | None = None, table: BodyTable | None = None
 ) -> None:
     """Raise `BadData` where an arm that the robot follows is not among the segments and points (None: all)."""
-    table, missing = table or load_table(), {}
-    sides = {arm.side for arm in robot.arms} | {table.side(tip) for tip in table.drawn_limbs}
-    for side in sides.intersection(robot.map.arms):
-        limb = find_person_arm(table, side)
+    table = table or load_table()
+    for arm in robot.arms:
+        limb = find_person_arm(table, arm.side)
         needed = (str(limb.base), *limb.segments[:-1])
-        missing[side] = [name for name in needed if name not in segments]
-        missing[side] += [name for name in limb.points if points is not None and name not in points]
-    text = "; ".join(
-        f"{robot.map.name}'s {arm.side} arm follows {', '.join(missing[arm.side])}, which the sensors do not measure"
-        for arm in robot.arms
-        if missing[arm.side]
-    )
-    if text:
-        usable = [f"choose arm {side}" for side, names in missing.items() if not names]
-        parts = [table.shared_name(name).replace("_", " ") for name in needed]
-        needs = f"an arm needs sensors on {', '.join(parts[:-1])} and {parts[-1]}"
-        raise BadData(f"{text}; {[*usable, needs][0]}")
+        missing = [name for name in needed if name not in segments]
+        missing += [name for name in limb.points if points is not None and name not in points]
+        if missing:
+            base, upper, fore = (table.shared_name(name).replace("_", " ") for name in needed)
+            raise BadData(
+                f"{robot.map.name}'s {arm.side} arm follows {', '.join(missing)}, which the sensors do not measure; an "
+                f"arm needs sensors on {base}, {upper} and {fore}; of two arms choose the other one"
+            )
 
 
 def compute_arm_targets(
@@ -259,8 +243,8 @@ def compute_swivel(upper: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 def _smooth(
     time: np.ndarray, motion: ArmMotion, known: np.ndarray, weight: np.ndarray, arm: Arm, smoothing_hz: float
-) -> HandPath:
-    """The path of a hand: bridged, low-passed, clamped to the reach."""
+) -> HandTarget:
+    """The target of a hand over time: bridged, low-passed, clamped to the reach."""
     t = time[known]
     offset, upper = (
         interp1d(t, x[known], axis=0, fill_value=(x[known][0], x[known][-1]), bounds_error=False)(time)
@@ -278,7 +262,7 @@ def _smooth(
     width = max(1, int(0.2 * rate_hz))
     weight = np.convolve(np.pad(weight, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), "valid")
     position, unclamped = arm.shoulder + clamp_to_reach(offset, arm.reach), arm.shoulder + offset
-    path = HandPath(position, position, R, position, compute_swivel(upper, offset), weight, unclamped, ~known)
+    path = HandTarget(position, position, R, position, compute_swivel(upper, offset), weight, unclamped, ~known)
     return path.differentiate(time)  # fills in the velocities
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -32,8 +32,8 @@ from .controller import ControllerParams, JointState, QpController, StepReport
 from .limits import MAX_STOP_S
 from .maps import find_map, list_sides
 from .placement import place_root
-from .robot import LimitMargins, Robot, load_robot
-from .targets import SMOOTHING_HZ, ArmTargets, HandPath, compute_arm_targets, compute_swivel
+from .robot import Robot, load_robot
+from .targets import SMOOTHING_HZ, ArmTargets, HandTarget, compute_arm_targets, compute_swivel
 
 RATE_HZ = 100.0
 PLAN_STEP_S = 0.01  # [s] of the first run at least, whatever the rate of the trajectory: coarser, the robot shakes
@@ -56,53 +56,35 @@ QUANTITIES = ("velocity", "acceleration", "jerk")
 STAGES = ("solving with wide limits", "solving with the robot's limits")  # of `progress`
 
 
-class LimitingJoint(NamedTuple):
-    """The joint that needs the largest slowdown."""
-
-    joint: str
-    time: float  # [s] of the recording
-    quantity: str  # of `QUANTITIES`
-
-
-class ControllerRun(NamedTuple):
-    """States and constraints of the controller at each sample. Over a step the jerk is constant."""
-
-    joint_position: np.ndarray  # (n, joints) [rad or m]
-    joint_velocity: np.ndarray  # (n, joints)
-    joint_acceleration: np.ndarray  # (n, joints)
-    hand: np.ndarray  # (arms, n, 3) [m] in B
-    rotation: np.ndarray  # (arms, n, 3, 3) of the hand
-    swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
-    report: StepReport  # of the step from each sample
-
-
 @dataclass(frozen=True)
 class Trajectory:
-    """A trajectory of the robot."""
+    """A trajectory of the robot. Over a step the jerk is constant, so that any denser rate keeps the same limits."""
 
     robot: Robot
-    collision: CollisionModel
     params: ControllerParams  # of the controller
-    arm_targets: ArmTargets  # of the recording, on its own time
+    scale: dict[str, float]  # side → metres of the robot for one metre of the person
     time: np.ndarray  # (n,) [s] from 0, at a constant rate
     recorded_time: np.ndarray  # (n,) [s] of the recording at each sample; during the approach that of its first sample
     approach_samples: int  # number of samples from rest to the first pose of the recording
-    targets: tuple[HandPath, ...]  # (arms,) paths of the hands, at `time`
-    run: ControllerRun  # joints, hands and constraints at `time`; any denser rate keeps the same limits
-    limiting_joint: LimitingJoint | None  # None where nothing had to be slowed for a limit
+    targets: tuple[HandTarget, ...]  # (arms,) over time
+    joint_position: np.ndarray  # (n, joints) [rad or m]
+    joint_velocity: np.ndarray  # (n, joints)
+    joint_acceleration: np.ndarray  # (n, joints)
+    p_BH: np.ndarray  # (arms, n, 3) [m] of the hands
+    R_BH: np.ndarray  # (arms, n, 3, 3)
+    swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
+    report: StepReport  # of the step from each sample
+    # The joint that needs the largest slowdown, the time [s] of the recording, and the quantity, of `QUANTITIES`; None
+    # where nothing had to be slowed for a limit.
+    slowest: dict[str, Any] | None
 
     def __repr__(self) -> str:
         return f"Trajectory({self.robot.map.name!r}: {self.time[-1]:.1f} s, {len(self.robot.names)} joints)"
 
     @property
-    def joint_position(self) -> np.ndarray:
-        """(n, joints) [rad or m]."""
-        return self.run.joint_position
-
-    @property
     def hand(self) -> dict[str, np.ndarray]:
         """Side → position (n, 3) [m] of the hand in B."""
-        return {arm.side: self.run.hand[i] for i, arm in enumerate(self.robot.arms)}
+        return {arm.side: self.p_BH[i] for i, arm in enumerate(self.robot.arms)}
 
     def joint_motion(self) -> JointMotion:
         """Return the motion as `export` takes it, the robot standing on the floor."""
@@ -116,7 +98,7 @@ class Trajectory:
             joints=robot.names,
             time=self.time,
             position=self.joint_position,
-            velocity=self.run.joint_velocity,
+            velocity=self.joint_velocity,
             posture=robot.posture,
             p_WB=p_WB,
             quat_WB=Rotation.from_matrix(R_WB).as_quat(),
@@ -200,8 +182,9 @@ def retarget(
     pose, body_table = _select_pose(pose, interval, phase)
     stated = {"arm": arm, "speed_scale": speed_scale, "limit_margin": limit_margin}
     if not isinstance(robot, Robot):
-        chosen = {name: stated[name] for name in ("speed_scale", "limit_margin") if stated[name] is not None}
-        robot = load_robot(find_map(str(robot)), list_sides(arm), LimitMargins(**chosen))  # type: ignore[arg-type]
+        margins = {"speed_scale": speed_scale, "limit_margin": limit_margin}
+        chosen = {name: value for name, value in margins.items() if value is not None}
+        robot = load_robot(find_map(str(robot)), list_sides(arm), **chosen)
     elif any(value is not None for value in stated.values()):
         raise BadOption(f"{', '.join(stated)}: a Robot has arms and margins of its own; `load_robot` takes them")
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
@@ -236,8 +219,8 @@ def _compute_trajectory(
     wide = QpController(robot, collision, step, params, WIDE_LIMIT_FACTOR, guarded=False)
     motion, approach_samples = _prepend_approach(wide, motion)
     run = _run_controller(wide, motion.hands, None, None, partial(progress, STAGES[0]))
-    path = gaussian_filter1d(run.joint_position, PATH_SMOOTHING_S / step, axis=0, mode="nearest")
-    slowdown, limiting = _compute_slowdown(path, robot, step, motion, approach_samples)
+    path = gaussian_filter1d(run["joint_position"], PATH_SMOOTHING_S / step, axis=0, mode="nearest")
+    slowdown, slowest = _compute_slowdown(path, robot, step, motion, approach_samples)
     # The motion's own time, its samples on the robot's time, and the moments of the motion at the robot's times.
     clock = np.arange(len(path)) * step
     sample_time = _stretch_end(np.concatenate([[0.0], np.cumsum(0.5 * (slowdown[1:] + slowdown[:-1])) * step]))
@@ -250,18 +233,17 @@ def _compute_trajectory(
     tracking_params = replace(params, posture=posture_weight, posture_gain=TRACKING_POSTURE_GAIN)
     tracking, settle = QpController(robot, collision, dt, tracking_params), int((sample_time[-1] + SETTLE_S) / dt)
     run = _run_controller(tracking, targets.hands, posture, settle, partial(progress, STAGES[1]))
-    n = len(run.joint_position)
+    n = len(run["joint_position"])
     return Trajectory(
         robot=robot,
-        collision=collision,
         params=params,
-        arm_targets=arm_targets,
+        scale=arm_targets.scale,
         time=robot_time[:n],
         recorded_time=recorded_time[:n],
         approach_samples=int(np.searchsorted(robot_time, sample_time[approach_samples])),
-        targets=tuple(HandPath(*(values[:n] for values in hand)) for hand in targets.hands),
-        run=run,
-        limiting_joint=limiting,
+        targets=tuple(hand.sample(slice(n)) for hand in targets.hands),
+        slowest=slowest,
+        **run,
     )
 
 
@@ -273,12 +255,14 @@ def check_rate(rate_hz: float) -> None:
 
 def _run_controller(
     controller: QpController,
-    hands: tuple[HandPath, ...],
+    hands: tuple[HandTarget, ...],
     posture: np.ndarray | None,
     settle: int | None,
     progress: Callable[[float], None],
-) -> ControllerRun:
+) -> dict[str, Any]:
     """Follow the hands from rest, and `posture` (n, joints) where they leave joints free; None: the rest posture.
+
+    Return the fields of `Trajectory` from `joint_position` to `report`.
 
     From the sample `settle` on the robot comes to rest as soon as it has settled; None: it does not.
     """
@@ -303,14 +287,14 @@ def _run_controller(
             break
         if k % PROGRESS_STEPS == 0:
             progress(k / n)
-    hand, rotation, elbow = (
+    p_BH, R_BH, elbow = (
         np.array([[pose[key] for pose in arms] for arms in zip(*poses, strict=True)]) for key in range(3)
     )
     shoulders = np.array([arm.shoulder for arm in robot.arms])[:, None]
-    swivel = compute_swivel(elbow - shoulders, hand - shoulders)
-    report = StepReport(*map(np.array, zip(*reports, strict=True)))
     position, velocity, acceleration = np.array(states).swapaxes(0, 1)
-    return ControllerRun(position, velocity, acceleration, hand, rotation, swivel, report)
+    run = {"joint_position": position, "joint_velocity": velocity, "joint_acceleration": acceleration}
+    run |= {"p_BH": p_BH, "R_BH": R_BH, "swivel": compute_swivel(elbow - shoulders, p_BH - shoulders)}
+    return run | {"report": StepReport(*map(np.array, zip(*reports, strict=True)))}
 
 
 def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[ArmTargets, int]:
@@ -343,8 +327,8 @@ def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[Arm
 
 def _compute_slowdown(
     path: np.ndarray, robot: Robot, dt: float, motion: ArmTargets, approach_samples: int
-) -> tuple[np.ndarray, LimitingJoint | None]:
-    """Return the time scaling (n,) ≥ 1 that a joint path (n, joints) needs, and the limiting joint."""
+) -> tuple[np.ndarray, dict[str, Any] | None]:
+    """Return the time scaling (n,) ≥ 1 that a joint path (n, joints) needs, and `Trajectory.slowest`."""
     v = np.gradient(path, dt, axis=0)
     a = np.gradient(v, dt, axis=0)
     jerk = np.gradient(a, dt, axis=0)
@@ -356,15 +340,15 @@ def _compute_slowdown(
         ]
     )
     longest = needed.max(axis=(0, 2))
-    limiting = None
+    slowest = None
     k = approach_samples + int(np.argmax(longest[approach_samples:]))
     if longest[k] > 1.0:
         quantity, j = np.unravel_index(int(np.argmax(needed[:, k])), needed[:, k].shape)
-        limiting = LimitingJoint(robot.names[j], float(motion.time[k]), QUANTITIES[quantity])
+        slowest = {"joint": robot.names[j], "time": float(motion.time[k]), "quantity": QUANTITIES[quantity]}
     slowdown = np.minimum(np.maximum(np.maximum(longest, 1.0), motion.slowdown), MAX_SLOWDOWN)
     width = max(1, round(SLOWDOWN_SPREAD_S / dt))
     wide = maximum_filter1d(slowdown, 2 * width + 1, mode="nearest")
-    return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), limiting
+    return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), slowest
 
 
 def _stretch_end(time: np.ndarray) -> np.ndarray:

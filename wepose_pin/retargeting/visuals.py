@@ -7,7 +7,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
 
 from ..body.urdf import find_mesh, package_folders, reduce_triangles, triangulate
 from .robot import Robot
@@ -23,6 +22,11 @@ class MeshPart(NamedTuple):
     vertices: np.ndarray
     triangles: np.ndarray
     rgba: tuple[float, float, float, float]
+
+    @property
+    def link(self) -> str:
+        """Its name on a page."""
+        return f"robot {self.joint}"
 
 
 def build_parts(robot: Robot) -> list[MeshPart]:
@@ -64,19 +68,6 @@ def compute_placements(
         for joint, (quat, position) in placements.items():
             p_quat = pin.SE3ToXYZQUAT(root * data.oMi[joint])
             quat[k], position[k] = p_quat[3:], p_quat[:3]
-    return placements
-
-
-def compute_target_placements(
-    trajectory: Trajectory, frames: np.ndarray, R: np.ndarray, p: np.ndarray
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Side → (quat_WJ (m, 4) xyzw, p_WJ (m, 3)) of the joint that carries the hand, were the hand at its target."""
-    placements = {}
-    for arm, target in zip(trajectory.robot.arms, trajectory.targets, strict=True):
-        hand = trajectory.robot.model.frames[arm.hand].placement
-        R_WJ = R @ target.rotation[frames] @ hand.rotation.T
-        p_WJ = target.unclamped[frames] @ R.T + p - R_WJ @ hand.translation
-        placements[arm.side] = (Rotation.from_matrix(R_WJ).as_quat(), p_WJ)
     return placements
 
 
