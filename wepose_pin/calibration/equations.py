@@ -149,12 +149,8 @@ class Layout:
     @property
     def scale_observed(self) -> bool:
         """Whether the closures determine the scale: by a recorded or known place, or by a link of known size."""
-        return any(
-            closure.kind == "recorded"
-            or closure.at is not None
-            or any(c.any() for p in paths for _, c in p.vectors.values())
-            for closure, paths in self.paths.items()
-        )
+        known = [c.any() for paths in self.paths.values() for path in paths for _, c in path.vectors.values()]
+        return any(known) or any(c.kind == "recorded" or c.at is not None for c in self.paths)
 
     @cached_property
     def functions(self) -> dict[Condition, tuple[ca.Function, ca.Function]]:

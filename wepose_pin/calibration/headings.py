@@ -32,16 +32,14 @@ from .equations import Gaussian, Layout
 from .least_squares import LEAST_CORRELATION_S, Observations
 from .protocols import Axis, Closure, Direction, FreeMotion
 
-# Of the search.
-STARTS, NEARER = 256, 64  # starts, and how many of the best continue after some rounds
+STARTS, NEARER = 256, 64  # starts of the search, and how many of the best continue after some rounds
 FIRST_ROUNDS, MORE_ROUNDS = 6, 16
 SEARCH_SAMPLES, LEAST_SEARCH_SAMPLES = 48, 8  # of all closures together, of each
 GAP_STD = 0.03  # [m] of a closure; includes errors of the lengths and all that the search leaves out
 KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount
 OUTLIER = 5.0  # standard deviations of a sample, at which it has a quarter of its weight
 _FIFTHS = 2.0 * np.pi / 5.0 * np.arange(5)
-# Of couplings.
-SAMPLES_HZ = 10.0
+SAMPLES_HZ = 10.0  # of couplings
 LEAST_S = 20.0  # of motion that is used
 LEAST_LEVER = 1e-6  # [1/s⁴], keeps unobserved levers finite
 LEAST_MISMATCH = 0.005  # [m/s²] below which no two sensors agree
@@ -200,12 +198,12 @@ def _descend(
 def _turn_by_hinges(observations: Observations, headings: np.ndarray) -> float:
     """Return the rotation [rad] of all headings by which segments lie on the side to which their hinges bend."""
     sensors, bent = observations.layout.sensors, 0.0j
+    turns = [Rotation.from_rotvec([0.0, 0.0, heading]) for heading in headings]
     for hinge in observations.layout.hinges:
-        R = []
-        for i in (sensors.index(hinge.on), sensors.index(hinge.moves)):
-            turn = Rotation.from_rotvec([0.0, 0.0, headings[i]])
-            R.append(turn * Rotation.from_quat(observations.data[4 * i : 4 * i + 4].T) * turn.inv())
-        along = (R[0].inv() * R[1]).apply(hinge.along)
+        pair = sensors.index(hinge.on), sensors.index(hinge.moves)
+        Q = (Rotation.from_quat(observations.data[4 * i : 4 * i + 4].T) for i in pair)
+        on, moves = (turns[i] * each * turns[i].inv() for i, each in zip(pair, Q, strict=True))
+        along = (on.inv() * moves).apply(hinge.along)
         bent += np.sum(along[:, 0] + 1j * along[:, 1]) * complex(hinge.side[0], -hinge.side[1])
     return -float(np.angle(bent)) if bent else 0.0
 
@@ -245,20 +243,18 @@ def estimate_couplings(
     return couplings
 
 
-def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling], start: np.ndarray) -> Gaussian:
-    """The prior of x with the headings and drifts of the couplings, whole turns as at `start`."""
-    if not couplings:
-        return prior
-    H, off = np.zeros((len(couplings), layout.size)), np.zeros(len(couplings))
+def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]) -> Gaussian:
+    """Return the prior of x with the headings and drifts of the couplings, whole turns as at its mean."""
     mean, information = prior
-    for row, coupling in enumerate(couplings):
+    H = np.zeros((len(couplings), layout.size))
+    for row, coupling in zip(H, couplings, strict=True):
         for name, sign in ((coupling.near, 1.0), (coupling.far, -1.0)):
             i = layout.sensors.index(name)
-            H[row, layout.heading[i]], H[row, layout.drift[i]] = sign, sign * coupling.elapsed_s
-        off[row] = H[row] @ (start - mean) + np.angle(np.exp(1j * (coupling.heading - H[row] @ start)))
-    weight = np.array([coupling.std**-2 for coupling in couplings])
-    information = information + H.T @ (weight[:, None] * H)
-    return mean + np.linalg.solve(information, H.T @ (weight * off)), information
+            row[layout.heading[i]], row[layout.drift[i]] = sign, sign * coupling.elapsed_s
+    off = wrap_angle(np.array([coupling.heading for coupling in couplings]) - H @ mean)
+    weighted = H.T * np.array([coupling.std**-2 for coupling in couplings])
+    information = information + weighted @ H
+    return mean + np.linalg.solve(information, weighted @ off), information
 
 
 def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name: str) -> np.ndarray:
@@ -287,7 +283,7 @@ def estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
     variance = max(float(np.mean(r**2)), LEAST_MISMATCH**2) * LEAST_CORRELATION_S * SAMPLES_HZ
     std = float(np.sqrt(variance / max(float(J @ J), 1e-12)))
     # Where little moves, a heading half a turn away explains it nearly as well: the whole circle's variance counts.
-    off = np.angle(np.exp(1j * (starts - heading)))
+    off = wrap_angle(starts - heading)
     distant = np.abs(off) > DISTANT
     mass = np.exp(-0.5 * np.maximum(costs[distant] - float(r @ r), 0.0) / variance) * (2.0 * np.pi / JOINT_STARTS)
     total = np.sqrt(2.0 * np.pi) * std + mass.sum()

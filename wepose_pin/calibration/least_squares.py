@@ -1,11 +1,8 @@
 """The least squares of a calibration in numbers: samples, prior and weights, and the solution by CasADi's `nlpsol`.
 
-The expressions are those of `equations`. Tests hold the solution against Gauss-Newton with Marquardt's damping in a few
-lines of NumPy.
-
-The weight of the data is measured, not assumed. In a few rounds of Gauss-Newton the residual's own mean square gives
-its variance, and its autocorrelation the effective sample size. Samples at which the palms are apart are outliers and
-lose their weight.
+The expressions are those of `equations`. The weight of the data is measured, not assumed. In a few rounds of
+Gauss-Newton the residual's own mean square gives its variance, and its autocorrelation the effective sample size.
+Samples at which the palms are apart are outliers and lose their weight.
 """
 
 from __future__ import annotations
@@ -88,6 +85,11 @@ class Observations:
                 poses.setdefault(condition.phase, []).append((condition, span))
         return poses
 
+    @property
+    def min_correlation(self) -> float:
+        """The number of samples in `LEAST_CORRELATION_S`."""
+        return LEAST_CORRELATION_S / max(float(np.median(np.diff(self.data[-1]))), 1e-3)
+
     @cached_property
     def _functions(self) -> list[tuple[tuple[ca.Function, ca.Function], ca.DM]]:
         """The functions of each condition with its data, which CasADi maps them over."""
@@ -138,19 +140,9 @@ class LeastSquares:
         return bounds
 
     @cached_property
-    def _residuals(self) -> tuple[np.ndarray, np.ndarray]:
-        r, gaps = self.observations.residuals(self.x)
-        return np.asarray(r).T, np.asarray(gaps).T
-
-    @property
     def residuals(self) -> np.ndarray:
         """(n, k) of the samples; the first three are those of a closure, whitened, or of another condition."""
-        return self._residuals[0]
-
-    @property
-    def gaps(self) -> np.ndarray:
-        """(n, 3) [m], zero without a closure."""
-        return self._residuals[1]
+        return np.asarray(self.observations.residuals(self.x)[0]).T
 
     @cached_property
     def jacobian(self) -> np.ndarray:
@@ -169,23 +161,20 @@ class LeastSquares:
         return np.linalg.inv(self.information)
 
     @property
-    def gradient(self) -> np.ndarray:
-        """(m,) of half the cost."""
-        weighted, (mean, information) = (self.weights * self.residuals).ravel(), self.prior
-        return self.jacobian.reshape(-1, len(self.x)).T @ weighted + information @ (self.x - mean)
-
-    @property
     def remaining(self) -> float:
         """What is left to go to the minimum [standard deviations], but for lengths at their bound."""
-        free = (self.x > self.lower_bounds + 1e-6) | (self.gradient < 0.0)
-        gradient = self.gradient[free]
+        weighted, (mean, information) = (self.weights * self.residuals).ravel(), self.prior
+        gradient = self.jacobian.reshape(-1, len(self.x)).T @ weighted + information @ (self.x - mean)
+        free = (self.x > self.lower_bounds + 1e-6) | (gradient < 0.0)
+        gradient = gradient[free]
         return float(np.sqrt(gradient @ np.linalg.solve(self.information[np.ix_(free, free)], gradient)))
 
 
 def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> LeastSquares:
     """Return the least squares at its minimum, by sequential quadratic programming with the Gauss-Newton Hessian.
 
-    It takes `steps` at most. Where they do not suffice it raises `NoSolution` if `strict`, else it returns the last x.
+    It takes `steps` at most. Where they do not suffice, or a length is at its bound, it raises `NoSolution` if
+    `strict`, else it returns the last x.
     """
     observations, (mean, information), weights = problem.observations, problem.prior, problem.weights
     start = np.maximum(problem.x, problem.lower_bounds)
@@ -218,10 +207,16 @@ def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> 
     if not np.all(np.isfinite(minimiser)):
         minimiser = np.zeros(len(start))
     solution = replace(problem, x=np.maximum(start + scale * minimiser, problem.lower_bounds))
-    if strict and not solution.remaining < LOOSE_TOLERANCE:
+    if not strict:
+        return solution
+    lengths, names = solution.x[observations.layout.length], observations.layout.lengths
+    failure = "" if solution.remaining < LOOSE_TOLERANCE else f"{solution.remaining:.2g} standard deviations to go"
+    if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
+        failure = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
+    if failure:
         raise NoSolution(
-            f"the lengths did not converge ({solution.remaining:.2g} standard deviations to go); check that the hands "
-            f"do in the phase what the protocol says, and that every sensor sits where the session says"
+            f"the lengths did not converge ({failure}); check that the points do in the phase what the protocol says, "
+            f"and that every sensor sits where the session says"
         )
     return solution
 
@@ -239,8 +234,8 @@ def solve_reweighted(
     few steps and without hinges.
     """
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
-    correlation, closures, poses = min_correlation(observations), observations.closures, observations.poses
-    stated, posed = _state_weights(observations, contact, correlation), dict[str, float]()
+    closures, poses = observations.closures, observations.poses
+    stated, posed = _state_weights(observations, contact), dict[str, float]()
     if quick:
         stated[:, GAP_ROWS:] = 0.0
     weights = stated.copy()
@@ -260,7 +255,7 @@ def solve_reweighted(
             contact[span] = np.where(weight > least, weight, 0.0)
         for block in _list_blocks(observations, contact, hinges=not quick):
             span, columns, touch, _ = block
-            variance, correlated = _measure_block(fit, block, correlation)
+            variance, correlated = _measure_block(fit, block)
             weights[span, columns] = touch[:, None] / (correlated * variance)
         if k == min(POSED_ROUND, rounds - 1):
             posed = {phase: _measure_pose(fit, own, stated, used=False) for phase, own in poses.items()}
@@ -271,7 +266,7 @@ def solve_reweighted(
     if not closures and not quick:
         posed = {phase: _measure_pose(fit, own, stated, used=True) for phase, own in poses.items()}
     blocks = _list_blocks(observations, contact, hinges=False)
-    size = sum((float(block[2].sum()) / _measure_block(fit, block, correlation)[1] for block in blocks), 0.0)
+    size = sum((float(block[2].sum()) / _measure_block(fit, block)[1] for block in blocks), 0.0)
     return replace(fit, effective_sample_size=size, posed=posed)
 
 
@@ -286,17 +281,19 @@ def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool =
     return [block for block in blocks if block[2].sum() > 0.0]
 
 
-def _measure_block(fit: LeastSquares, block: Block, least: float) -> tuple[float, float]:
-    """Return the variance of a block's residuals, and of how many samples one is independent, at least `least`."""
+def _measure_block(fit: LeastSquares, block: Block) -> tuple[float, float]:
+    """Return the variance of a block's residuals, and of how many samples one is independent."""
     span, columns, contact, least_variance = block
     r = fit.residuals[span, columns]
     variance = float(contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(contact.sum()))
-    return max(variance, least_variance), count_correlated_samples(r * contact[:, None], least)
+    return max(variance, least_variance), count_correlated_samples(
+        r * contact[:, None], fit.observations.min_correlation
+    )
 
 
-def _state_weights(observations: Observations, contact: np.ndarray, correlation: float) -> np.ndarray:
+def _state_weights(observations: Observations, contact: np.ndarray) -> np.ndarray:
     """Return the weights (n, k) of poses, which are stated, and those of closures to begin with."""
-    weights = np.full((len(observations), observations.layout.residuals), 1.0 / correlation)
+    weights = np.full((len(observations), observations.layout.residuals), 1.0 / observations.min_correlation)
     weights[:, :GAP_ROWS] *= contact[:, None]
     for condition, span in observations.spans:
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
@@ -308,11 +305,6 @@ def _state_weights(observations: Observations, contact: np.ndarray, correlation:
         if not isinstance(condition, Closure):
             weights[span] = size**-2 / (span.stop - span.start)
     return weights
-
-
-def min_correlation(observations: Observations) -> float:
-    """The number of samples in `LEAST_CORRELATION_S`."""
-    return LEAST_CORRELATION_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)
 
 
 def count_correlated_samples(r: np.ndarray, least: float) -> float:
@@ -335,13 +327,13 @@ def estimate_covariance(fit: LeastSquares) -> np.ndarray:
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
     observations, weights, J, C = fit.observations, fit.weights, fit.jacobian, fit.covariance
-    gradient, least = fit.prior[1].copy(), min_correlation(observations)
+    gradient = fit.prior[1].copy()
     for condition, span in observations.spans:
         if not isinstance(condition, Closure):
             gradient += np.einsum("nk,nki,nkj->ij", weights[span], J[span], J[span], optimize=True)
     for block in _list_blocks(observations, fit.contact):
         span, columns, contact, _ = block
-        slope, (variance, duration) = J[span, columns], _measure_block(fit, block, least)
+        slope, (variance, duration) = J[span, columns], _measure_block(fit, block)
         # The fit has reduced the residuals: their variance gets back what it took.
         taken = np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
         variance += float(contact @ taken) / (slope.shape[1] * float(contact.sum()))
@@ -368,16 +360,12 @@ class MeasuredLength(NamedTuple):
         return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
 
 
-def compare_measured(
-    fit: LeastSquares, measured: Mapping[str, tuple[float, float]], least_std: float
-) -> dict[str, MeasuredLength]:
-    """Each measured length, name → ([m], its standard deviation [m]), beside the solution without it.
-
-    `least_std` [m] is that of any estimate of a length.
-    """
-    compared = {}
+def compare_measured(fit: LeastSquares, measured: Mapping[str, tuple[float, float]]) -> dict[str, MeasuredLength]:
+    """Return each measured length, name → ([m], its standard deviation [m]), beside the solution without it."""
+    layout, compared = fit.observations.layout, {}
+    least_std = 0.0 if layout.model.table.is_mechanism else LEAST_LENGTH_STD
     for name, (metres, std) in measured.items():
-        row = fit.observations.layout.lengths.index(name)
+        row = layout.lengths.index(name)
         variance = fit.covariance[row, row]
         rest = 1.0 / variance - 1.0 / std**2  # information without that of the measured length
         expected = metres + (fit.x[row] - metres) / (variance * rest)

@@ -5,14 +5,10 @@ gap is linear in the lengths ℓ, g = A ℓ at each sample, and the lengths are 
 
     ½ Σ ‖A ℓ‖²   with   E ℓ = d,
 
-and not shorter than `MIN_LENGTH`. There is no prior, so E and d state what the gap does not show:
-
-- Measured lengths. At least one fixes the scale: ℓ = 0 closes the chain perfectly.
-- Lengths that always rotate together, as a forearm and a hand without a sensor: the gap shows their sum. Their
-  proportions are those of the population.
-- Lengths outside the chain, as the trunk: those of the population.
-
-The shoulders are fixed on the trunk: no girdle moves them, in the subject neither.
+and not shorter than `MIN_LENGTH`. There is no prior, so E and d state what the gap does not show: measured lengths, of
+which at least one fixes the scale, as ℓ = 0 closes the chain perfectly; the population's proportions of lengths that
+always rotate together, as a forearm and a hand without a sensor; and its lengths outside the chain, as the trunk. No
+girdle moves the shoulders, in the subject neither.
 
 The covariance follows from the scatter of the gap and from the errors of d. It does not contain the errors of what is
 not estimated: mounts, headings and their drift, soft tissue. `full` estimates these.
@@ -32,7 +28,7 @@ from ..body.girdle import FIXED
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
-from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples, min_correlation
+from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples
 from .problem import CalibrationProblem
 from .protocols import Closure
 from .result import Calibration
@@ -61,7 +57,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
         for name, R_VS in filtered.R_VS.items()
     }
-    names = tuple(problem.model.lengths)
+    names = problem.layout.lengths
     A = np.zeros((len(samples), 3, len(names)))
     for closure, span in observations.closures:
         [path] = problem.layout.paths[closure]
@@ -84,7 +80,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         shortest = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
         raise NoSolution(f"{recording.where()}: the gap is least with {shortest}; {advice}")
     gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in names]
-    correlated = count_correlated_samples(gaps, min_correlation(observations))  # samples that make one independent one
+    correlated = count_correlated_samples(gaps, observations.min_correlation)  # samples that make one independent one
     variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
     covariance = correlated * variance * by_gap + by_d @ d_cov @ by_d.T
     others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
@@ -139,17 +135,15 @@ def _check_problem(problem: CalibrationProblem) -> None:
 
 def _state_constraints(problem: CalibrationProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return E (m, k), d (m,) and its covariance (m, m): measured lengths, and what only the population tells."""
-    groups = problem.layout.length_groups.values()
-    names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
-    unit, assumed = dict(zip(names, np.eye(len(names)), strict=True)), list[np.ndarray]()
+    groups, measured = problem.layout.length_groups.values(), problem.measured
+    names, prior = problem.layout.lengths, problem.prior
+    unit = dict(zip(names, np.eye(len(names)), strict=True))
+    rows, lengths, covariance = [unit[name] for name in measured], dict(prior.lengths), prior.lengths_covariance(names)
     for group in groups:  # proportions
-        shares = [unit[name] / prior.lengths[name] for name in group if name not in measured]
-        assumed += [a - b for a, b in pairwise(shares)]
-    assumed += [unit[name] for name in names if name not in {*measured, *(n for group in groups for n in group)}]
-    E_assumed = np.array(assumed).reshape(-1, len(names))
-    d_assumed, cov_assumed = E_assumed @ [prior.lengths[n] for n in names], prior.lengths_covariance(names)
-    return (
-        np.vstack([[unit[name] for name in measured], E_assumed]),
-        np.concatenate([[metres for metres, _ in measured.values()], d_assumed]),
-        block_diag(np.diag([std**2 for _, std in measured.values()]), E_assumed @ cov_assumed @ E_assumed.T),
-    )
+        rows += [a - b for a, b in pairwise(unit[n] / prior.lengths[n] for n in group if n not in measured)]
+    rows += [unit[name] for name in names if name not in {*measured, *(n for group in groups for n in group)}]
+    for i, name in [(names.index(name), name) for name in measured]:
+        lengths[name], std = measured[name]
+        covariance[i], covariance[:, i], covariance[i, i] = 0.0, 0.0, std**2
+    E = np.array(rows)
+    return E, E @ [lengths[name] for name in names], E @ covariance @ E.T

@@ -74,9 +74,7 @@ class CalibrationProblem:
 
     @property
     def measured_example(self) -> str:
-        """The measurement that would fix the scale best, as ``name=metres``: the protocol's, then the longest length in
-        a closure that was not measured.
-        """
+        """The best measurement of the scale, ``name=metres``: the protocol's, then the longest length of a closure."""
         names = [name for name in self.layout.lengths_in_closures if name not in self.measured]
         if not names or (self.protocol.measured_example and not self.measured):
             return self.protocol.measured_example
@@ -90,11 +88,11 @@ class CalibrationProblem:
         mount = find_nominal_mount(self.recording, segment, self.prior, start_pose)
         return None if mount is None else start_pose.to_world(segment, Rotation.from_quat(mount))
 
-    def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
-        """Return segment → ψ [rad] by its mount, of those of these segments whose mount is known."""
-        mounts = {segment: self.mount(segment) for segment in segments}
-        R_VS_start = self.filtered.R_VS_start
-        return {k: compute_heading_offset(R_VS_start[k], mount) for k, mount in mounts.items() if mount is not None}
+    @cached_property
+    def stated_headings(self) -> dict[str, float]:
+        """Segment → ψ [rad] by its mount, of those whose mount is known."""
+        starts = [(name, R_VS, self.mount(name)) for name, R_VS in self.filtered.R_VS_start.items()]
+        return {name: compute_heading_offset(R_VS, mount) for name, R_VS, mount in starts if mount is not None}
 
     def sensor_prior(self, segment: str) -> Gaussian:
         """Return what start pose and mount tell of a sensor's (ε_x, ε_y, ψ): mean (3,) and information (3, 3).
@@ -111,8 +109,7 @@ class CalibrationProblem:
             mean[:2] = own.start_mean[:2]
         if mount is None:
             return mean, information
-        R_VS_start = self.filtered.R_VS_start[segment]
-        heading = [0.0, 0.0, compute_heading_offset(R_VS_start, mount)]
+        heading = [0.0, 0.0, self.stated_headings[segment]]
         covariance = find_mount_covariance(recording, segment, self.prior)
         if covariance is not None:
             of_mount = np.linalg.inv(R_start @ covariance @ R_start.T + 1e-12 * np.eye(3))
@@ -120,7 +117,7 @@ class CalibrationProblem:
             of_mount = np.diag([0.0, 0.0, STATED_STD**-2])
         else:
             of_mount = np.eye(3) / MEASURED_ORIENTATION_STD**2
-        misfit = (Rotation.from_rotvec(heading) * R_VS_start * mount.inv()).as_rotvec()
+        misfit = (Rotation.from_rotvec(heading) * self.filtered.R_VS_start[segment] * mount.inv()).as_rotvec()
         signs = np.diag([-1.0, -1.0, 1.0])
         both = information + signs @ of_mount @ signs
         target = information @ mean - signs @ of_mount @ np.append(misfit[:2], 0.0)
@@ -252,16 +249,14 @@ class CalibrationProblem:
             places.append(place)
             seconds = len(samples) * stride / recording.rate_hz
             if seconds < LEAST_S:
-                because = ""
-                if not connected[phase].all():
-                    because = (
-                        f"; sensors.{lost} is lost from {format_span(loss)}, and its heading with it: name a start "
-                        f"pose and a motion with nothing lost between them, or record again"
-                    )
-                raise BadPhase(
-                    f"{recording.where()}: {_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; "
-                    f"at least {LEAST_S:g} s are needed, better a minute{because}"
+                text = (
+                    f"{_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; at least {LEAST_S:g}"
                 )
+                text += " s are needed, better a minute"
+                if not connected[phase].all():
+                    text += f"; sensors.{lost} is lost from {format_span(loss)}, and its heading with it: name a start "
+                    text += "pose and a motion with nothing lost between them, or record again"
+                raise BadPhase(f"{recording.where()}: {text}")
         samples = np.concatenate(parts)
         rotations_since_start = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors

@@ -11,8 +11,6 @@ those of the body's table (`wepose_pin.body.BodyTable`). There are four kinds of
 - ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does it.
 - ``[[axis]]``: a segment bends forwards about its own y, as the torso in a bow; `std_deg` is how far people are off.
 
-Names joined by "+", as in ``clasp+t_pose``, are one protocol after another in the same session.
-
 The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.
 """
 
@@ -192,7 +190,7 @@ def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:
 
 
 def load_protocol(name: str | Path) -> Protocol:
-    """A protocol by its name, from a TOML file of one's own, or several of them joined by "+".
+    """A protocol by its name, from a TOML file of one's own, or one after another joined by "+", as ``clasp+t_pose``.
 
     It raises `BadOption` where there is no such protocol, or its file has a key or value that is none.
     """
