@@ -96,16 +96,11 @@ DOT = (
 
 def dot(path: Path, mode: str = "rates", *, tag: str = "left_wrist", sync: str = "Synced", first_us: int = 0) -> Path:
     fine = [str((first_us + 10000 * k) % 2**32) for k in range(N)]
-    step = np.concatenate([np.zeros((1, 3)), (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()])
     modes: dict[str, dict[str, np.ndarray]] = {
         "rates": {
             "Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ,
             "Acc_X,Acc_Y,Acc_Z": own(ACCEL, path),
             "Gyr_X,Gyr_Y,Gyr_Z": np.degrees(GYRO),
-        },
-        "increments": {
-            "dq_W,dq_X,dq_Y,dq_Z": Rotation.from_rotvec(step).as_quat()[:, [3, 0, 1, 2]],
-            "dv[1],dv[2],dv[3]": ACCEL / RATE,
         },
         "quaternion": {"Quat_W,Quat_X,Quat_Y,Quat_Z": WXYZ, "FreeAcc_X,FreeAcc_Y,FreeAcc_Z": ACCEL},
         "euler": {"Euler_X,Euler_Y,Euler_Z": np.degrees(R_WS.as_euler("ZYX"))[:, ::-1]},

@@ -21,9 +21,9 @@ from .errors import BadData, MissingFile, UnknownColumn, one_of
 from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
+LONGEST_LINE = 1 << 18  # [bytes] that are read of a file without line ends
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
-# The names of a CSV stand within its first lines, or bytes.
-MOST_PREAMBLE, PREAMBLE_BYTES = 100, 1 << 20
+MOST_PREAMBLE = 100  # first lines of a CSV in which its names stand
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
 _UNITS = re.compile(
     r"[\[(]?(s|ms|[uµμ]s|ns|sec(onds?)?|m/\(?s(\^2|²|/s|\^2\))\)?|m/s\*\*2|m?g|deg(rees)?|rad|(deg|rad|°|dps)(/s(ec)?)?|"
@@ -51,6 +51,19 @@ def read_table(path: Path) -> pl.DataFrame:
     if table.width > 1 and table[table.columns[-1]].null_count():
         _find_ragged(path, body, len(names), layout.separator)
     return table
+
+
+def read_first_lines(path: Path, most: int = 100) -> list[str]:
+    """Read the first lines of a text in UTF-8, or as Windows writes it; empty ones follow the end of the file."""
+    try:
+        with path.open("rb") as file:
+            lines = [file.readline(LONGEST_LINE).rstrip(b"\r\n") for _ in range(most)]
+    except OSError as error:
+        raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        return [line.decode("utf-8-sig") for line in lines]
+    except UnicodeDecodeError:
+        return [line.decode("cp1252", errors="replace") for line in lines]
 
 
 def read_body(path: Path, head_lines: int) -> bytes:
@@ -179,22 +192,16 @@ def read_layout(path: Path) -> CsvLayout:
     they are in the line right above that row, or above a line of units. Raise `BadData` where the file is empty or no
     text.
     """
-    with library_errors(path, "a CSV"), path.open("rb") as file:
-        start = file.read(PREAMBLE_BYTES)
-        raw = start.split(b"\n")[: -1 if file.read(1) else None] or [start]
-    lines = [(k, line) for k, line in enumerate(raw) if line.strip() and not line.startswith(b"#")][:MOST_PREAMBLE]
-    if not lines:
+    lines = enumerate(read_first_lines(path, MOST_PREAMBLE))
+    text = [(k, line) for k, line in lines if line.strip() and not line.startswith("#")]
+    if not text:
         raise BadData(f"{path}: is empty; a line with the names of the columns and then numbers are needed")
-    if b"\0" in lines[0][1]:
+    if "\0" in text[0][1]:
         raise BadData(f"{path}: is not a CSV in UTF-8: there are zero bytes in its first line; save it as UTF-8")
-    try:
-        text = [(k, line.decode("utf-8-sig")) for k, line in lines]
-    except UnicodeDecodeError:  # as spreadsheets of Windows write it
-        text = [(k, line.decode("cp1252", errors="replace")) for k, line in lines]
     # Semicolons or tabs where most lines have them, else commas.
     separator = next((sign for sign in ";\t" if 2 * sum(sign in line for _, line in text) > len(text)), ",")
     with library_errors(path, "a CSV"):
-        rows = [next(csv.reader([line.rstrip("\r\n")], delimiter=separator), []) for _, line in text]
+        rows = [next(csv.reader([line], delimiter=separator), []) for _, line in text]
     first, last, units = _find_names(rows)
     return CsvLayout(_join_names(rows[first:last]), units, separator, text[last if units else last - 1][0] + 1)
 

@@ -19,7 +19,7 @@ import polars as pl
 
 from ..body import BodyTable, load_table
 from ..data_tables import FORMATS as TABLES
-from ..data_tables import read_columns, read_names, read_table
+from ..data_tables import read_columns, read_first_lines, read_names, read_table
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
@@ -30,7 +30,7 @@ from ..recording.gaps import find_runs
 from ..recording.limits import LONGEST_STEP_S
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
-from .device import Device, read_first_lines
+from .device import Device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .reference import read_reference

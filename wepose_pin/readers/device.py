@@ -13,7 +13,7 @@ import numpy as np
 
 from ..body import load_table
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, MissingFile, one_of
+from ..errors import BadData, one_of
 from ..libraries import library_errors
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
@@ -183,13 +183,3 @@ def check_measured(place: str, values: np.ndarray) -> None:
     if too_large.size:
         largest = np.nanmax(np.abs(values[too_large[0]]))
         raise BadData(f"{place} holds {largest:.3g} in row {too_large[0] + 1}; no device measures as much")
-
-
-def read_first_lines(path: Path, most: int = 100) -> list[str]:
-    """Read the first lines of a text file; bytes that are not UTF-8 are replaced."""
-    try:
-        with path.open("rb") as file:
-            # The limit bounds the memory for a file without line ends.
-            return [file.readline(2**16).decode("utf-8-sig", errors="replace").rstrip("\r\n") for _ in range(most)]
-    except OSError as error:
-        raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -163,59 +163,46 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     return Device(kinds[0], sensors, since_power_on=False, aligned=aligned, diagnostics=diagnostics)
 
 
-def read_messages(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Iterate over topic and content of each message, the header first; an empty topic ends a file that is complete."""
+def _read_content(path: Path) -> tuple[dict[str, Any], Arrivals, list[dict[str, Any]], np.ndarray, bool]:
+    """Read header, samples, events, a row a pose (its tick and xyzw of each sensor), and whether the end is there."""
     from mcap.records import Channel, Footer, Message, Metadata
     from mcap.stream_reader import StreamReader
 
+    header: dict[str, Any] = {}
+    events: list[dict[str, Any]] = []
     topics: dict[int, str] = {}
+    record: Any = None
+    samples, poses = array("d"), array("d")  # eight numbers a sample, and a tick with four numbers a sensor
     with path.open("rb") as file:
         records = iter(StreamReader(file, validate_crcs=True, record_size_limit=LONGEST_RECORD).records)
-        while True:
+        while not isinstance(record, Footer):
             try:
                 record = next(records)
             except Exception:  # cut off or damaged: the library raises errors of many kinds
-                return
-            if isinstance(record, Message):
-                yield topics.get(record.channel_id, HEADER), record.data
-            elif isinstance(record, Channel):
+                break
+            if isinstance(record, Channel):
                 topics[record.id] = record.topic
-            elif isinstance(record, Metadata) and record.name == HEADER:
-                yield HEADER, record.metadata.get("json", "").encode()
-            elif isinstance(record, Footer):
-                yield "", b""
-                return
-
-
-def _read_content(path: Path) -> tuple[dict[str, Any], Arrivals, list[dict[str, Any]], np.ndarray, bool]:
-    """Read header, samples, events, a row a pose (its tick and xyzw of each sensor), and whether the end is there."""
-    header: dict[str, Any] = {}
-    events: list[dict[str, Any]] = []
-    is_complete = False
-    samples, poses = array("d"), array("d")  # eight numbers a sample, and a tick with four numbers a sensor
-    for topic, text in read_messages(path):
-        if not topic:
-            is_complete = True
-            continue
-        message = json.loads(text)
-        if topic == HEADER and not header:
-            if message["format"] != FORMAT:
-                raise BadData(f"{path}: is of format {message['format']}; this version reads format {FORMAT}")
-            header = {"subject": None, "joints": {}, "model": "", "orientations": {}, **message}
-        elif topic == EVENTS:
-            events.append(message)
-        elif topic == POSES:
-            poses.append(message["tick"])
-            for name in header["sensors"]:
-                poses.extend(message["quat_WL"][name])
-        elif topic.startswith(SENSORS):
-            samples.extend((header["sensors"].index(topic.removeprefix(SENSORS)), message["t"]))
-            packed = [*message["orientation"], 0.0, 0.0] if "orientation" in message else None
-            samples.extend(packed or [*message["gyro"], *message["accel"]])
+            elif isinstance(record, Metadata) and record.name == HEADER and not header:
+                header = {"subject": None, "joints": {}, "model": "", "orientations": {}}
+                header |= json.loads(record.metadata.get("json", ""))
+                if header["format"] != FORMAT:
+                    raise BadData(f"{path}: is of format {header['format']}; this version reads format {FORMAT}")
+            elif isinstance(record, Message):
+                topic, message = topics[record.channel_id], json.loads(record.data)
+                if topic == EVENTS:
+                    events.append(message)
+                elif topic == POSES:
+                    poses.append(message["tick"])
+                    for name in header["sensors"]:
+                        poses.extend(message["quat_WL"][name])
+                elif topic.startswith(SENSORS):
+                    samples.extend((header["sensors"].index(topic.removeprefix(SENSORS)), message["t"]))
+                    packed = [*message["orientation"], 0.0, 0.0] if "orientation" in message else None
+                    samples.extend(packed or [*message["gyro"], *message["accel"]])
     which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
     arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
     rows = np.array(poses).reshape(-1, 1 + 4 * len(header.get("sensors", ())))
-    return header, arrivals, events, rows, is_complete
+    return header, arrivals, events, rows, isinstance(record, Footer)
 
 
 def build_recording(

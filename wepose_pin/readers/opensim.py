@@ -12,10 +12,10 @@ from pathlib import Path
 
 import polars as pl
 
-from ..data_tables import read_body
+from ..data_tables import read_body, read_first_lines
 from ..errors import BadData
 from ..libraries import library_errors
-from .device import Device, Signal, make_device, read_first_lines
+from .device import Device, Signal, make_device
 
 # The header line of files that `wepose export` wrote, in OpenSim's ground. OpenSim takes it for a remark.
 OWN = ("Frames", "bodies of Rajagopal's model in ground")

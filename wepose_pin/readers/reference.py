@@ -16,7 +16,6 @@ Sources: the C3D File Format user guide (c3d.org); HAS-Motion's description of R
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -26,16 +25,15 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..data_tables import read_body
+from ..data_tables import read_body, read_first_lines
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, one_of
 from ..libraries import check_file, import_library, library_errors
-from .device import Reference, check_measured, read_first_lines
+from .device import Reference, check_measured
 from .mvnx import read_mvnx_reference
 
 SUFFIXES = (".c3d", ".trc", ".mvnx")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "millimeters": 1e-3}
-SIDES = ({"side": "left", "S": "L", "s": "l"}, {"side": "right", "S": "R", "s": "r"})
 # The axes of a segment's frame (x forward, y left, z up in the N-pose) that a direction is of.
 DIRECTIONS = {"up": "z", "left": "y", "forward": "x", "lateral": "y"}
 # Table → what its entries look like.
@@ -162,7 +160,7 @@ def _read_trc(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 class MarkerTable(NamedTuple):
-    """How points and segments follow from markers, with sides written out."""
+    """How points and segments follow from markers."""
 
     points: Mapping[str, Sequence[Sequence[str]]]
     segments: Mapping[str, Sequence[Mapping[str, Sequence[Sequence[str]]]]]
@@ -187,17 +185,11 @@ def read_marker_table(path: Path | None = None) -> MarkerTable:
 def _read_table(path: Path) -> MarkerTable:
     top = TomlTable(read_toml(path, "a table of markers"), str(path))
     top.allow(*_FORMS)
-    entries: dict[str, dict[str, Any]] = {key: {} for key in _FORMS}
+    entries: dict[str, Any] = {key: top.table(key, {}).values for key in _FORMS}
     for key, form in _FORMS.items():
-        for name, value in top.table(key, {}).values.items():
-            for side in SIDES if "{" in name else SIDES[:1]:
-                own = json.dumps({name: value}, default=str)
-                for sign, word in side.items():
-                    own = own.replace(f"{{{sign}}}", word)
-                ((own_name, entry),) = json.loads(own).items()
-                if not _has_form(key, entry):
-                    raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
-                entries[key][own_name] = entry
+        for name, entry in entries[key].items():
+            if not _has_form(key, entry):
+                raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
     return MarkerTable(**entries)
 
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..data_tables import read_first_lines
 from ..errors import BadData, BadSession, WeposeError, one_of
 from ..libraries import check_file, find_plugins, load_plugin
-from .device import Device, read_first_lines
+from .device import Device
 from .live_log import is_live_log, read_live_device
 from .mvnx import read_mvnx
 from .opensim import read_opensim

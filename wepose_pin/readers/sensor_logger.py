@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..data_tables import read_columns, read_table
+from ..data_tables import read_columns, read_first_lines, read_table
 from ..diagnostics import WARNING, Diagnostic
-from .device import Device, Signal, join_signals, make_device, open_folder, read_first_lines
+from .device import Device, Signal, join_signals, make_device, open_folder
 
 COLUMNS = {
     **dict.fromkeys(("Gyroscope", "TotalAcceleration", "Accelerometer", "Gravity"), ("x", "y", "z")),

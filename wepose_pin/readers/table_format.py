@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..data_tables import parse_rows, read_body, read_columns
+from ..data_tables import parse_rows, read_body, read_columns, read_first_lines
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import Key, TomlTable, read_record, read_toml
 from ..errors import BadData, BadSession, MissingRate
@@ -32,7 +32,6 @@ from .device import (
     convert,
     make_device,
     open_folder,
-    read_first_lines,
     spread_equal_times,
 )
 
@@ -56,7 +55,6 @@ class Columns(NamedTuple):
     columns: tuple[str, ...]  # one pattern with groups axis, sensor, side, unit; or the names of a file with one sensor
     unit: str = ""  # where neither the name nor a line of units has it
     limit: float = np.inf  # [SI] where a value is beyond, the next columns of the format are taken if they are there
-    increments: bool = False  # over a sample: a quaternion of the rotation, m/s
 
     def match(self, name: str, axes: str) -> tuple[str, int, str] | None:
         """Return sensor, index among the columns, and unit of a column; None: it is none of these."""
@@ -130,10 +128,9 @@ class TableFormat(NamedTuple):
             own = devices.setdefault(sensor or alone, {})
             for name in NEEDED[kind] if set(NEEDED[kind]) <= set(signals) else ():
                 first, *others = signals[name]
-                time = _read_time(self, first, sensor, None if joins else rate_hz)
-                values = _read_values(name, first, time)
+                time, values = _read_time(self, first, sensor, None if joins else rate_hz), _read_values(name, first)
                 if others and (np.abs(values) > first.format.limit).any():
-                    values = _read_values(name, others[0], time)
+                    values = _read_values(name, others[0])
                 own[name] = Signal(time, values)
         diagnostics = []
         # Clocks of devices that were not synchronized start at power-on.
@@ -169,13 +166,14 @@ def load_format(path: Path) -> TableFormat:
     patterns += [text for clock in clocks for text in (clock.column, clock.rate)]
     for signal, each in entries.items():
         for entry, columns in each:
-            counts = (4,) if signal == "gyro" and columns.increments else _COUNTS[signal]
-            if len(columns.columns) not in counts:
-                needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
-                raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {needed} are needed")
-            if len(columns.columns) == 1 and "(?P<axis>" not in columns.columns[0]:
-                raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; (?P<axis>...) is needed in it")
-            patterns += columns.columns if len(columns.columns) == 1 else ()
+            count, needed = len(columns.columns), ""
+            if count not in _COUNTS[signal]:
+                needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in _COUNTS[signal])
+            elif count == 1 and "(?P<axis>" not in columns.columns[0]:
+                needed = "a pattern with (?P<axis>...)"
+            if needed:
+                raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; needed: {needed}")
+            patterns += columns.columns if count == 1 else ()
     for text in patterns:
         try:
             re.compile(text)
@@ -357,27 +355,11 @@ def _name_alone(format: TableFormat, path: Path) -> str:
     return path.stem
 
 
-def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
-    """Read values in SI; an orientation as xyzw, NaN where there is none."""
-    table = source.table
-    values = table.numbers(source.columns)
-    if signal == "orientation":
-        return _read_quat(table.path, values)
-    if not source.format.increments:
-        return convert(table.path, signal, values, source.unit, table.names[source.columns[0]])
-    steps = np.diff(time)
-    step = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else 0.0
-    if not step > 0.0:
-        raise BadData(f"{table.path}: its time does not grow from row to row, so that increments give no rate")
-    if signal == "gyro":
-        good = np.isfinite(values).all(axis=1) & (np.linalg.norm(values, axis=1) > 0.5)
-        quat, values = values[good][:, [1, 2, 3, 0]], np.full((len(values), 3), np.nan)
-        values[good] = Rotation.from_quat(quat).as_rotvec()
-    return values / step
-
-
-def _read_quat(path: Path, values: np.ndarray) -> np.ndarray:
-    """Return quaternions (n, 4) xyzw of wxyz, matrices by rows, or roll, pitch, yaw [deg]."""
+def _read_values(signal: str, source: _Source) -> np.ndarray:
+    """Read values in SI; an orientation as xyzw from wxyz, matrices by rows, or roll, pitch, yaw [deg]; NaN: none."""
+    path, values = source.table.path, source.table.numbers(source.columns)
+    if signal != "orientation":
+        return convert(path, signal, values, source.unit, source.table.names[source.columns[0]])
     if values.shape[1] == 4:
         return values[:, [1, 2, 3, 0]]
     quat = np.full((len(values), 4), np.nan)
