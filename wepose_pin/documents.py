@@ -142,11 +142,6 @@ def toml_string(text: str) -> str:
     return json.dumps(sound, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def toml_strings(texts: Iterable[str]) -> str:
-    """Format a list of texts for TOML."""
-    return f"[{', '.join(map(toml_string, texts))}]"
-
-
 def toml_key(name: str) -> str:
     """Format a key for TOML: names of links and joints in a URDF may have any characters."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_string(name)

@@ -11,7 +11,7 @@ follow the limbs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -69,24 +69,23 @@ class KinematicsSolver:
             raise BadData("no segment has an orientation: a pose needs one")
         check_segments(model.table, segments, f"{model.pin.name}: ", BadModel)
         m, is_mechanism = model.pin, model.table.is_mechanism
-        self._model, self.segments, self._neutral = model, tuple(segments), pin.neutral(m)
+        self._model, self.segments, self._limits, self._neutral = model, tuple(segments), limits, pin.neutral(m)
         self._last: np.ndarray | None = None  # (nq,) of the frame before
         fitted = _find_fitted(model, segments)
         joints = sorted({joint for name in fitted for joint in model.chains[name]})
         if is_mechanism:
             self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
         self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
-        self._bends, spherical = [], []
+        self._bent, spherical = [], []
         for name in () if is_mechanism else self.segments:
-            last = model.find_spherical(name)
-            if last is None:
+            if model.find_spherical(name) is None:
                 continue
-            row, above, R_AL, R_AJ = _relate(model, name, self.segments)
-            if len(R_AJ) == 1:
-                (R,) = R_AJ.values()
-                spherical.append((row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[last]))
-            else:
-                self._bends.append(_make_bend(model, (row, above, R_AL, R_AJ), limits))
+            relation = _relate(model, name, self.segments)
+            row, above, R_AL, R_AJ, _ = relation
+            if len(R_AJ) > 1:
+                self._bent.append(relation)
+            for joint, R in R_AJ.items() if len(R_AJ) == 1 else ():
+                spherical.append((row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[joint]))
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
         self._girdles = [
@@ -105,8 +104,8 @@ class KinematicsSolver:
         q[:] = self._neutral
         if self._spherical:
             _set_relative_rotations(quat_WL, *self._spherical, q)
-        for bend in self._bends:
-            bend(q, quat_WL)
+        for relation in self._bent:
+            _bend(self._model.pin, q, quat_WL, relation, limits=self._limits)
         if self._fit is not None:
             self._fit.run(q, quat_WL, self._last)
         for girdle, at in self._girdles:
@@ -165,13 +164,12 @@ def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
     return fitted
 
 
-_Relation = tuple[int, int, Rotation, dict[int, Rotation]]
+# How a segment L hangs on the measured segment A above, or on W: rows of L and A (-1: W) in orientations; R_AL, and
+# R_AJ of its joints up to the spherical one, with all joints at zero; and in how many places these are.
+_Relation = tuple[int, int, Rotation, dict[int, Rotation], int]
 
 
 def _relate(model: BodyModel, segment: str, segments: Sequence[str]) -> _Relation:
-    """Return how a segment L hangs on the measured segment A above, or on W: rows of L and A (-1: W) in `segments`,
-    R_AL, and R_AJ of the joints up to the spherical one, with all joints at zero; those behind it rest.
-    """
     m, data, above = model.pin, model.pin.createData(), model.parents[segment]
     while above is not None and not (above in segments and model.chains[above]):
         above = model.parents[above]
@@ -181,42 +179,32 @@ def _relate(model: BodyModel, segment: str, segments: Sequence[str]) -> _Relatio
     last = model.find_spherical(segment) or 0
     joints = [joint for joint in model.chains[segment] if joint <= last]
     R_AJ = {joint: Rotation.from_matrix(R_AW @ data.oMi[joint].rotation) for joint in joints}
-    return segments.index(segment), -1 if above is None else segments.index(above), R_AL, R_AJ
+    steps = np.diff([data.oMi[joint].translation for joint in joints], axis=0)
+    places = 1 + int(np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE))
+    return segments.index(segment), -1 if above is None else segments.index(above), R_AL, R_AJ, places
 
 
-def _make_bend(model: BodyModel, relation: _Relation, limits: bool) -> Callable[[np.ndarray, np.ndarray], None]:
-    """Return the function that writes several joints' values into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw.
-
-    Each place takes an equal share of the tilt, the last joint the rest. Joints that meet in a point are one place.
-    """
-    m, data, (row, above, R_AL, R_AJ) = model.pin, model.pin.createData(), relation
-    pin.forwardKinematics(m, data, pin.neutral(m))
-    steps = np.diff([data.oMi[joint].translation for joint in R_AJ], axis=0)
-    places = 1 + np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE)
-    up = R_AL.apply([0.0, 0.0, 1.0])
-
-    def bend(q: np.ndarray, quat_WL: np.ndarray) -> None:
-        R_WA = quat_WL[:, above] if above >= 0 else _IDENTITY
-        left = multiply(multiply(conjugate(R_WA), quat_WL[:, row]), R_AL.inv().as_quat())
-        # The turn about the vertical before the tilt is taken off; upside down no turn is better than another.
-        turn = np.column_stack([np.outer(left[:, :3] @ up, up), left[:, 3]])
-        turn[np.linalg.norm(turn, axis=1) < 1e-9] = _IDENTITY
-        turn /= np.linalg.norm(turn, axis=1)[:, None]
-        share = 1.0 / places * log(multiply(left, conjugate(turn)))  # (n, 3)
-        for k, (joint, R) in enumerate(R_AJ.items(), start=1):
-            at = m.idx_qs[joint]
-            if m.nqs[joint] == 4:
-                rotation = exp(share) if k < len(R_AJ) else left
-                q[:, at : at + 4] = multiply(multiply(R.inv().as_quat(), rotation), R.as_quat())
-            else:
-                axis = R.apply(m.joints[joint].extract().axis)
-                q[:, at] = share @ axis
-                if limits:
-                    q[:, at] = np.clip(q[:, at], m.lowerPositionLimit[at], m.upperPositionLimit[at])
-                rotation = rotation_about(axis, q[:, at])
-            left = multiply(conjugate(rotation), left)
-
-    return bend
+def _bend(m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation, *, limits: bool) -> None:
+    """Write the joints' values into `q` (n, nq): an equal share of the tilt in each place, the rest in the last."""
+    row, above, R_AL, R_AJ, places = relation
+    R_WA, up = quat_WL[:, above] if above >= 0 else _IDENTITY, R_AL.apply([0.0, 0.0, 1.0])
+    left = multiply(multiply(conjugate(R_WA), quat_WL[:, row]), R_AL.inv().as_quat())
+    # The turn about the vertical before the tilt is taken off; upside down no turn is better than another.
+    turn = np.column_stack([np.outer(left[:, :3] @ up, up), left[:, 3]])
+    turn[np.linalg.norm(turn, axis=1) < 1e-9] = _IDENTITY
+    turn /= np.linalg.norm(turn, axis=1)[:, None]
+    share = 1.0 / places * log(multiply(left, conjugate(turn)))  # (n, 3)
+    for k, (joint, R) in enumerate(R_AJ.items(), start=1):
+        at = m.idx_qs[joint]
+        if m.nqs[joint] == 4:
+            rotation = exp(share) if k < len(R_AJ) else left
+            q[:, at : at + 4] = multiply(multiply(R.inv().as_quat(), rotation), R.as_quat())
+        else:
+            axis = R.apply(m.joints[joint].extract().axis)
+            ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else (-np.inf, np.inf)
+            q[:, at] = np.clip(share @ axis, *ends)
+            rotation = rotation_about(axis, q[:, at])
+        left = multiply(conjugate(rotation), left)
 
 
 @kernel

@@ -94,19 +94,18 @@ def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str 
 def find_known_points(model: BodyModel, segments: Iterable[str]) -> list[str]:
     """Find the points that follow from the measured segments: those that no open motion moves."""
     moved = _find_open_motions(model, list(segments), list(model.point_frames.values()))[1][:, :3]
-    return [point for point, J in zip(model.point_frames, moved, strict=True) if not np.any(np.abs(J) > _DETERMINED)]
+    return [point for point, J in zip(model.point_frames, moved, strict=True) if np.abs(J).max(initial=0) < _DETERMINED]
 
 
 def find_known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
     """Find the links whose pose follows from the measured segments; of a mechanism those that carry measured ones."""
-    m, segments = model.pin, list(segments)
-    links = [frame.name for frame in m.frames[1:]]
+    m, segments, links = model.pin, list(segments), [frame.name for frame in model.pin.frames[1:]]
     if model.table.is_mechanism:
         carriers = {m.frames[m.getFrameId(segment)].parentJoint for segment in segments}
         above = {0}.union(*(m.supports[carrier].tolist() for carrier in carriers))
         return [link for link in links if m.frames[m.getFrameId(link)].parentJoint in above]
     moved = _find_open_motions(model, segments, links)[1]
-    return [link for link, J in zip(links, moved, strict=True) if not np.any(np.abs(J) > _DETERMINED)]
+    return [link for link, J in zip(links, moved, strict=True) if np.abs(J).max(initial=0.0) < _DETERMINED]
 
 
 def find_undetermined_joints(model: BodyModel, segments: Iterable[str]) -> list[str]:

@@ -6,7 +6,6 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -14,7 +13,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import NonNegative, Range, check_arguments, check_fields, check_names, check_numbers
-from ..diagnostics import notebook_html
 from ..documents import (
     Key,
     TomlTable,
@@ -22,7 +20,7 @@ from ..documents import (
     format_toml,
     read_record,
     read_toml,
-    toml_strings,
+    toml_string,
     whole_file,
 )
 from ..errors import BadData, BadModel, BadOption, BadSubject
@@ -104,17 +102,6 @@ class Subject:
         quality = f", calibration {self.quality}" if self.quality else ""
         return f"Subject({self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts{quality})"
 
-    def _repr_html_(self) -> str:
-        return notebook_html(self, tables=[self.lengths_html()])
-
-    def lengths_html(self) -> str:
-        """Return the lengths with their standard deviations as a table for a notebook."""
-        rows = (
-            f"<tr><td>{escape(name)}</td><td>{1e3 * length:.0f} ± {1e3 * self.std(name):.0f} mm</td></tr>"
-            for name, length in self.lengths.items()
-        )
-        return f"<table>{''.join(rows)}</table>"
-
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Write ``subject.toml``, which `load_subject` and ``wepose track --subject`` read.
 
@@ -155,10 +142,9 @@ class Subject:
         """Check all fields and return the subject; `where` begins the text of a `BadOption` or `BadSubject`."""
         where = where or f"subject {self.name!r}: "
         check_fields(self, where)
-        arrays: dict[str, tuple[Any, int]] = {f"mounts.{name}": (quat, 4) for name, quat in self.mounts.items()}
+        sizes = {"mounts": 4, "start_pose_offset": 3, "heading_drift": 2, "girdles": len(PARAMETERS)}
+        arrays = {f"{key}.{name}": (own, n) for key, n in sizes.items() for name, own in getattr(self, key).items()}
         arrays |= {f"hinges.{name}.axis": (hinge.axis, 3) for name, hinge in self.hinges.items()}
-        for field_name, size in (("start_pose_offset", 3), ("heading_drift", 2), ("girdles", len(PARAMETERS))):
-            arrays |= {f"{field_name}.{name}": (each, size) for name, each in getattr(self, field_name).items()}
         try:
             named = [row for row in self.order if not _ROW.fullmatch(row)]
             check_names(f"{where}covariance.order", named, self.lengths)
@@ -269,11 +255,15 @@ class Subject:
         The parameters are in the order and units of `girdles`. Where this subject has no covariance of them, it is the
         spread of people that the table states.
         """
-        rows, k = girdle_rows(table), len(table.lengths)
+        rows, k, girdles = girdle_rows(table), len(table.lengths), table.girdles
         covariance = self.lengths_covariance([*table.lengths, *rows])
         if not set(rows) <= set(self.order):
+            std = np.ravel([(each.law_std, *each.rest_std, *each.raised_std) for each in girdles.values()])
+            alike = [[girdles[a].alike if table.counterpart(a) == b else 0.0 for b in girdles] for a in girdles]
+            both_sides = np.diag([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # the law and the place at rest
+            correlation = np.eye(std.size) + np.kron(np.reshape(alike, (len(girdles), len(girdles))), both_sides)
             covariance[k:] = covariance[:, k:] = 0.0
-            covariance[k:, k:] = compute_girdle_prior(table)
+            covariance[k:, k:] = correlation * np.outer(std, std)
         return covariance
 
     def mount_covariance(self, segment: str) -> np.ndarray | None:
@@ -292,16 +282,6 @@ def mount_rows(segment: str) -> list[str]:
 def girdle_rows(table: BodyTable) -> list[str]:
     """Return the names of the rows of all girdles' parameters in a subject's covariance."""
     return [f"girdles.{name}.{parameter}" for name in table.girdles for parameter in PARAMETERS]
-
-
-def compute_girdle_prior(table: BodyTable) -> np.ndarray:
-    """Compute the covariance (7 g, 7 g) of the parameters of a body's g girdles before a calibration."""
-    girdles = table.girdles
-    std = np.ravel([(each.law_std, *each.rest_std, *each.raised_std) for each in girdles.values()])
-    alike = [[girdles[a].alike if table.counterpart(a) == b else 0.0 for b in girdles] for a in girdles]
-    both_sides = np.diag([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # the law and the place at rest
-    correlation = np.eye(std.size) + np.kron(np.reshape(alike, (len(girdles), len(girdles))), both_sides)
-    return np.asarray(correlation * np.outer(std, std))
 
 
 def population_subject(
@@ -370,7 +350,8 @@ def subject_toml(subject: Subject) -> str:
     if subject.order:
         values["lengths_std"] = {name: f"{subject.std(name):.6f}" for name in subject.lengths if name in subject.order}
         rows = [f"    [{', '.join(f'{v:.9e}' for v in row)}],\n" for row in subject.covariance]
-        values["covariance"] = {"order": toml_strings(subject.order), "matrix": f"[\n{''.join(rows)}]"}
+        order = f"[{', '.join(map(toml_string, subject.order))}]"
+        values["covariance"] = {"order": order, "matrix": f"[\n{''.join(rows)}]"}
     return "\n".join([_COMMENT, *format_toml(values)]) + "\n"
 
 
@@ -414,7 +395,6 @@ def parse_subject(text: str, path: Path) -> Subject:
 
 
 def _subject(values: Mapping[str, Any], path: Path) -> Subject:
-    """Return the subject of the parsed file."""
     top = TomlTable(values, str(path), error=BadSubject)
     if values.get("format") != FORMAT:
         has = f"format = {values.get('format')!r}"
@@ -425,20 +405,15 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     table, std = top.table("covariance", {}), top.table("lengths_std", {})
     table.allow("order", "matrix")
     std.allow(*subject.lengths)
+    order = table.texts("order") if table.values else tuple(name for name in subject.lengths if name in std)
+    covariance = np.diag([(std.number(name, 0.0) or 0.0) ** 2 for name in order])
     if table.values:
-        order = table.texts("order")
         try:
             covariance = np.array(table.values.get("matrix"), dtype=float)
         except (TypeError, ValueError, OverflowError):
             raise BadSubject(f"{table.at('matrix')}: rows of numbers are needed, of one length") from None
-    else:
-        order = tuple(name for name in subject.lengths if name in std)
-        covariance = np.diag([(std.number(name, 0.0) or 0.0) ** 2 for name in order])
     subject = replace(subject, order=order, covariance=covariance).check(f"{path}: ")
     # What the digits of the file leave of a unit vector's length.
-    units = {name: hinge.axis / np.linalg.norm(hinge.axis) for name, hinge in subject.hinges.items()}
-    return replace(
-        subject,
-        mounts={name: quat / np.linalg.norm(quat) for name, quat in subject.mounts.items()},
-        hinges={name: hinge._replace(axis=units[name]) for name, hinge in subject.hinges.items()},
-    )
+    mounts = {name: quat / np.linalg.norm(quat) for name, quat in subject.mounts.items()}
+    hinges = {name: each._replace(axis=each.axis / np.linalg.norm(each.axis)) for name, each in subject.hinges.items()}
+    return replace(subject, mounts=mounts, hinges=hinges)

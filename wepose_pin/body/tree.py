@@ -231,23 +231,23 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
         carry(link, parent, M_JL)
         for first in tree.below[link]:
             M_Jc = M_JL * pin.SE3(joint_placement(first))
-            triple = _find_triple(first, tree, links) if spherical else None
-            child = first.child if triple is None else triple[-1].child
+            triple, own_axes = _find_triple(first, tree, links) if spherical else ([], None)
+            child = [first, *triple][-1].child
             if first.type == "fixed":
                 grow(child, parent, M_Jc)
-            elif triple is None and first.type != "floating":
+            elif not triple and first.type != "floating":
                 grow(child, _add_single(model, parent, M_Jc, first, where), pin.SE3.Identity())
             else:
-                for joint in (triple or [first])[1:]:
+                for joint in triple[1:]:
                     M_Jc = M_Jc * pin.SE3(joint_placement(joint))
                 joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
-                if triple is not None:
-                    axes[child] = _find_axes(triple)
-                    # The links between the axes, as they stand at zero.
-                    M_cK = pin.SE3.Identity()
-                    for joint in triple[:0:-1]:
-                        M_cK = M_cK * pin.SE3(joint_placement(joint)).inverse()
-                        carry(joint.parent, joints[child], M_cK)
+                if own_axes is not None:
+                    axes[child] = own_axes
+                # The links between the axes, as they stand at zero.
+                M_cK = pin.SE3.Identity()
+                for joint in triple[:0:-1]:
+                    M_cK = M_cK * pin.SE3(joint_placement(joint)).inverse()
+                    carry(joint.parent, joints[child], M_cK)
                 grow(child, joints[child], pin.SE3.Identity())
 
     grow(tree.root, 0, pin.SE3.Identity())
@@ -266,30 +266,25 @@ def joint_axis(joint: Any) -> np.ndarray:
     return axis / norm if norm > 1e-9 else np.zeros(3)
 
 
-def _find_triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> list[Any] | None:
-    """Find the three revolute joints that begin with `first` and together are a spherical joint."""
+def _find_triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> tuple[list[Any], np.ndarray | None]:
+    """Find the three revolute joints that begin with `first` and together are a spherical joint; none: they are not.
+
+    Second: their axes (3, 3), a row each, in the frame of the last one's child, all joints at zero.
+    """
     chain = [first]
     while len(chain) < 3:
         below, link = tree.below[chain[-1].child], links[chain[-1].child]
         is_heavy = link.inertial is not None and (link.inertial.mass or 0.0) > _LIGHT
         if len(below) != 1 or link.visuals or link.collisions or is_heavy:
-            return None
+            return [], None
         chain.append(below[0])
     turn = all(joint.type in ("revolute", "continuous") for joint in chain)
     meet = all(np.linalg.norm(joint_placement(joint)[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
-    axes = _find_axes(chain)
-    return chain if turn and meet and np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE else None
-
-
-def _find_axes(chain: list[Any]) -> np.ndarray:
-    """Return the axes (3, 3), a row each, in the frame of the last joint's child, all joints at zero."""
-    rows = []
+    axes = np.array([joint_axis(joint) for joint in chain])
     for k, joint in enumerate(chain):
-        axis = joint_axis(joint)
-        for later in chain[k + 1 :]:
-            axis = joint_placement(later)[:3, :3].T @ axis
-        rows.append(axis)
-    return np.array(rows)
+        axes[:k] = axes[:k] @ joint_placement(joint)[:3, :3]
+    is_triple = turn and meet and np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE
+    return (chain, axes) if is_triple else ([], None)
 
 
 def _find_bounds(joint: Any) -> tuple[float, float]:

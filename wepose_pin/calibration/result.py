@@ -173,7 +173,7 @@ class Calibration:
         return f"Calibration({self.subject.name!r}: {self.quality.quality}; {lengths}{remedy})"
 
     def _repr_html_(self) -> str:
-        return notebook_html(self, self.diagnostics, [self.subject.lengths_html()])
+        return notebook_html(self, self.diagnostics)
 
 
 # Quality --------------------------------------------------------------------------------------------------------------
