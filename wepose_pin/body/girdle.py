@@ -68,8 +68,12 @@ class Girdle(NamedTuple):
         return lengths[self.scaled_by] / self.scale if self.scaled_by in lengths else 1.0
 
 
-def _make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
-    """Make the law of these functions: displacement x, y, z [m] and s, by `Girdle.law`, a direction and the scale."""
+def make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
+    """Make the law of these functions, of numbers or of CasADi's symbols.
+
+    It returns the displacement x, y, z [m] in the frame of `on`, and s, by `Girdle.law`, the limb's unit direction x,
+    y, z there, from its first point on, and the scale.
+    """
 
     def law(g, x, y, z, scale):  # type: ignore[no-untyped-def]
         sine = sqrt(x * x + y * y + _LEAST_SINE)
@@ -82,20 +86,7 @@ def _make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
     return law
 
 
-_displace_one = inlined(_make_law(math.sqrt, math.atan2, min, math.exp))
-
-
-def displace(girdle: Girdle, along: Any, scale: Any, functions: Any) -> tuple[tuple[Any, Any, Any], Any]:
-    """Return the law's displacement (x, y, z) [m] in the frame of `on`, and s.
-
-    Parameters
-    ----------
-    along : (x, y, z) of the limb's unit direction, from its first point on, in the frame of `on`
-    functions : `numpy`, or `casadi` for symbols
-    """
-    law = _make_law(functions.sqrt, functions.arctan2, functions.fmin, functions.exp)
-    x, y, z, s = law(girdle.law, *along, scale)
-    return (x, y, z), s
+_displace = inlined(make_law(math.sqrt, math.atan2, min, math.exp))
 
 
 @kernel
@@ -113,7 +104,7 @@ def follow_law(quat, on, moves, along, law, scale, own, out):  # type: ignore[no
             tx, ty, tz, tw = product(x, y, z, w, along[0], along[1], along[2], 0.0)
             rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
             norm = x * x + y * y + z * z + w * w
-            dx, dy, dz, s = _displace_one(law, rx / norm, ry / norm, rz / norm, scale)
+            dx, dy, dz, s = _displace(law, rx / norm, ry / norm, rz / norm, scale)
         out[i, 0] = (1.0 + own[0]) * dx + own[1] + s * own[4]
         out[i, 1] = (1.0 + own[0]) * dy + own[2] + s * own[5]
         out[i, 2] = (1.0 + own[0]) * dz + own[3] + s * own[6]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -40,22 +41,20 @@ def make_personal(tissue: SoftTissue, share: float, lag: float, scatter: float) 
     scatter : as of `estimate_scatter`
     """
 
-    def remain(std: Sequence[float], mean: Sequence[float]) -> tuple[float, float, float]:
-        x, y, z = scatter * np.sqrt(np.maximum(np.square(std) - np.square(mean), 0.0))
-        return x, y, z
+    def remain(std: Any, mean: Any) -> Any:
+        return tuple(scatter * np.sqrt(np.maximum(np.square(std) - np.square(mean), 0.0)))
 
-    def scale(mean: Sequence[float]) -> tuple[float, float, float]:
-        x, y, z = (share * each for each in mean)
-        return x, y, z
-
+    mean_per_tilt, mean_per_raised = (
+        (share * x, share * y, share * z) for x, y, z in (tissue.mean_per_tilt, tissue.mean_per_raised)
+    )
     return tissue._replace(
         std=remain(tissue.std, ZERO),
         per_tilt=remain(tissue.per_tilt, tissue.mean_per_tilt),
         per_twist=scatter * np.sqrt(max(tissue.per_twist**2 - tissue.mean_per_twist**2, 0.0)),
         per_raised=remain(tissue.per_raised, tissue.mean_per_raised),
-        mean_per_tilt=scale(tissue.mean_per_tilt),
+        mean_per_tilt=mean_per_tilt,
         mean_per_twist=lag,
-        mean_per_raised=scale(tissue.mean_per_raised),
+        mean_per_raised=mean_per_raised,
     )
 
 

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from ..body import BodyModel
-from ..body.girdle import PARAMETERS, displace
+from ..body.girdle import PARAMETERS, make_law
 from ..body.links import find_carrier
 from ..body.mounts import StartPose
 from ..body.table import Vector
@@ -173,7 +173,8 @@ class PointPath:
         R_on, scale = ca.DM(start.rotation(girdle.on)), girdle.find_scale(self._model.lengths)
         along_W = rotate(quat_WL[girdle.moves], start.turn(girdle.moves, table.segments[girdle.moves].along))
         along = R_on.T @ rotate_back(quat_WL[girdle.on], along_W)
-        by_law, raised = displace(girdle, ca.vertsplit(along), scale, ca)
+        law = make_law(ca.sqrt, ca.arctan2, ca.fmin, ca.exp)
+        *by_law, raised = law(girdle.law, *ca.vertsplit(along), scale)
         own = (1.0 + parameters[0]) * ca.vertcat(*by_law) + parameters[1:4] + raised * parameters[4:]
         return rotate(quat_WL[girdle.on], R_on @ own)
 
