@@ -40,10 +40,9 @@ from ..body.configuration import KinematicsSolver
 from ..body.links import find_known_links
 from ..errors import BadOption
 from ..report.viewer import DARK, LIGHT, choose_trail_colour, fill_page, find_floor, scene, view
-from ..retargeting.placement import place_beside_person
 from ..retargeting.robot import Robot
 from ..retargeting.targets import find_person_arm
-from ..retargeting.visuals import MeshPart, build_parts
+from ..retargeting.visuals import MeshPart, build_parts, place_beside_person
 from .sources.udp import LOOPBACK, name_host
 from .state import QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
 

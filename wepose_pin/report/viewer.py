@@ -115,9 +115,8 @@ def find_floor(model: BodyModel) -> float:
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "") -> str:
     """The page on which a person and the robot that does as they do move together, on the robot's time."""
-    from ..retargeting.placement import place_beside_person
     from ..retargeting.targets import find_person_arm
-    from ..retargeting.visuals import build_parts, compute_placements
+    from ..retargeting.visuals import build_parts, compute_placements, place_beside_person
 
     frames = frame_indices(trajectory.time, FRAMES_A_SECOND)
     nearest = np.searchsorted(0.5 * (pose.time[:-1] + pose.time[1:]), trajectory.recorded_time[frames])
@@ -127,7 +126,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     shoulder_z = float(np.nanmedian([pose.points[arm.points[0]][:, 2] for arm in arms.values()]))
     floor_z = find_floor(model)
     root = R_WB, p_WB = place_beside_person(robot, shoulder_z, floor_z)
-    placed |= {f"robot {joint}": at for joint, at in compute_placements(trajectory, parts, frames, *root).items()}
+    placed |= compute_placements(robot, trajectory.joint_position[frames], parts, *root)
     trails = {}  # short names: heads are beside them
     for side, arm in arms.items():
         colour = choose_trail_colour(arm.tip, model)

@@ -18,8 +18,8 @@ from ..recording.gaps import find_runs
 from ..writers.motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
 from .checks import LimitCheck, SelfCollisions
-from .placement import place_root
 from .trajectory import Trajectory
+from .visuals import place_root
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names

@@ -31,9 +31,9 @@ from .collision import CollisionModel
 from .controller import ControllerParams, JointState, QpController, StepReport
 from .limits import MAX_STOP_S
 from .maps import find_map, list_sides
-from .placement import place_root
 from .robot import Robot, load_robot
 from .targets import SMOOTHING_HZ, ArmTargets, HandTarget, compute_arm_targets, compute_swivel
+from .visuals import place_root
 
 RATE_HZ = 100.0
 PLAN_STEP_S = 0.01  # [s] of the first run at least, whatever the rate of the trajectory: coarser, the robot shakes

@@ -1,18 +1,20 @@
-"""Visual meshes of a robot: triangles for each moving part, few enough for a page."""
+"""How a robot is drawn: triangles for each moving part, few enough for a page, and where its root is in W."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from ..body.urdf import find_mesh, package_folders, reduce_triangles, triangulate
+from .collision import list_corners
 from .robot import Robot
-from .trajectory import Trajectory
 
 BODY, LEFT, RIGHT = (0.80, 0.82, 0.85, 1.0), (0.93, 0.66, 0.50, 1.0), (0.52, 0.70, 0.85, 1.0)
+SIDE_DISTANCE = 1.35  # [m] of the robot to the left of the person
+STANDING_HEIGHT = 0.75  # [m] of the shoulders above the lowest point, from which on the robot stands on the floor
 
 
 class MeshPart(NamedTuple):
@@ -56,19 +58,43 @@ def build_parts(robot: Robot) -> list[MeshPart]:
 
 
 def compute_placements(
-    trajectory: Trajectory, parts: list[MeshPart], frames: np.ndarray, R: np.ndarray, p: np.ndarray
-) -> dict[int, Any]:
-    """Joint → (quat_WJ (m, 4) xyzw, p_WJ (m, 3)) at samples `frames`, with the root at `R`, `p` in W."""
-    robot, joints = trajectory.robot, sorted({part.joint for part in parts})
-    data = robot.model.createData()
-    root = pin.SE3(R, p)
-    placements = {joint: (np.empty((len(frames), 4)), np.empty((len(frames), 3))) for joint in joints}
-    for k, frame in enumerate(frames.tolist()):
-        pin.forwardKinematics(robot.model, data, robot.configuration(trajectory.joint_position[frame]))
-        for joint, (quat, position) in placements.items():
-            p_quat = pin.SE3ToXYZQUAT(root * data.oMi[joint])
-            quat[k], position[k] = p_quat[3:], p_quat[:3]
-    return placements
+    robot: Robot, joint_position: np.ndarray, parts: list[MeshPart], R_WB: np.ndarray, p_WB: np.ndarray
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Name of a part → (quat_WJ (m, 4) xyzw, p_WJ (m, 3)) at `joint_position` (m, joints)."""
+    data, root = robot.model.createData(), pin.SE3(R_WB, p_WB)
+    names = {part.joint: part.link for part in parts}
+    placed = {joint: np.empty((len(joint_position), 7)) for joint in names}
+    for k, position in enumerate(joint_position):
+        pin.forwardKinematics(robot.model, data, robot.configuration(position))
+        for joint, placement in placed.items():
+            placement[k] = pin.SE3ToXYZQUAT(root * data.oMi[joint])
+    return {names[joint]: (placement[:, 3:], placement[:, :3]) for joint, placement in placed.items()}
+
+
+def place_root(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """R_WB (3, 3) and p_WB (3,) [m] of the root in W: where a standing robot is on the floor, else at its origin."""
+    R_WB, data, p_WB = robot.R_BT.T, robot.model.createData(), np.zeros(3)
+    pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
+    lowest = [
+        (R_WB @ data.oMi[shape.parentJoint].act(corner))[2]
+        for shape in robot.geometry.geometryObjects
+        for corner in list_corners(shape)
+    ]
+    if lowest and _find_shoulder(robot)[2] - min(lowest) > STANDING_HEIGHT:
+        p_WB[2] = -min(lowest)
+    return R_WB, p_WB
+
+
+def _find_shoulder(robot: Robot) -> np.ndarray:
+    """(3,) [m] the middle of the shoulders, from the root along the axes of W."""
+    return np.asarray(robot.R_BT.T @ np.mean([arm.shoulder for arm in robot.arms], axis=0))
+
+
+def place_beside_person(robot: Robot, shoulder_z: float, floor_z: float) -> tuple[np.ndarray, np.ndarray]:
+    """R_WB (3, 3) and p_WB (3,) [m]: the root in W, beside the person and facing the same way."""
+    (R_WB, (_, _, height)), shoulder = place_root(robot), _find_shoulder(robot)
+    z = floor_z + height if height else shoulder_z - shoulder[2]
+    return R_WB, np.array([-shoulder[0], SIDE_DISTANCE - shoulder[1], z])
 
 
 def _choose_colour(robot: Robot, joint: int) -> tuple[float, float, float, float]:
