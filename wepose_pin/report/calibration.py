@@ -12,7 +12,7 @@ from ..diagnostics import lines
 from ..recording import Recording, compute_mount, find_mount_axes
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
 from .page import Banner, Item, render_page
-from .words import Table, capital, kinds, listed, number, plain, plus_minus, spread
+from .words import Table, kinds, listed, number, plain, plus_minus, spread
 
 QUALITIES = {
     "pass": "**Pass:** the calibration is good to use.",
@@ -23,7 +23,7 @@ QUALITIES = {
 
 def render_calibration_report(calibration: Calibration, recording: Recording) -> str:
     """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic."""
-    quality, gap = calibration.quality, capital(_name_gap(calibration))
+    quality, gap = calibration.quality, _name_gap(calibration)
     entries = lines(quality.further, titled=True)
     has_gap = np.count_nonzero(np.isfinite(calibration.gap)) > 1
     return render_page(
@@ -43,13 +43,13 @@ def render_calibration_report(calibration: Calibration, recording: Recording) ->
 
 
 def _name_gap(calibration: Calibration) -> str:
-    """What the gap of the protocol's closures is, as "palm to palm"."""
+    """What the gap of the protocol's closures is, as "Palm to palm"."""
     closures, table = calibration.problem.protocol.closures, calibration.problem.model.table
     points = dict.fromkeys(point for closure in closures for point in closure.points)
     several = listed(kinds(table, points))
     if closures and closures[0].kind == "coincide":
-        return " to ".join(plain(table.shared_name(point)) for point in points)
-    return f"gap of the {several}" if points else "gap"
+        return " to ".join(plain(table.shared_name(point)) for point in points).capitalize()
+    return f"Gap of the {several}" if points else "Gap"
 
 
 # Sections -------------------------------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ def _list_sensors(calibration: Calibration) -> list[Item]:
 def describe_gap(calibration: Calibration) -> str:
     """The gap before and after, and how much the motion tells."""
     return (
-        f"{capital(_name_gap(calibration))}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm "
+        f"{_name_gap(calibration)}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm "
         f"before, {1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
         f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
     )

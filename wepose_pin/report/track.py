@@ -11,6 +11,7 @@ from ..angles import AUTO, Angles, joint_angles, summary
 from ..body import BodyTable
 from ..body.links import compute_axis_std
 from ..errors import BadData
+from ..recording import format_span
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (
     SOURCES,
@@ -39,7 +40,7 @@ from .figures import (
 )
 from .page import Frame, Item, render_page, show_diagnostics
 from .viewer import MOST_FRAMES_INSIDE, pose_html
-from .words import Table, intervals, kinds, listed, number, plain, plural, spread
+from .words import Table, kinds, listed, number, plain, plural, spread
 
 PATH_POINTS = 1000
 VIEWS = (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0))  # axes across and up
@@ -144,7 +145,9 @@ def _describe_recording(tracked: TrackResult) -> str:
 
 def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     rate_hz, rows = tracked.recording.rate_hz, []
-    phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in tracked.recording.phases.items())
+    phases = "; ".join(
+        f"{name} {', '.join(map(format_span, spans))}" for name, spans in tracked.recording.phases.items()
+    )
     for name, (rate, cut) in measures.signals.items():
         gap, orientation = tracked.recording.sensors[name].gap, tracked.segments.orientation.get(name)
         lost = 0 if gap is None else np.count_nonzero(gap)

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..body import BodyTable
-from ..recording import format_span
 
 
 class Table(NamedTuple):
@@ -22,10 +21,6 @@ class Table(NamedTuple):
     def longest(self) -> int:
         """Letters of its longest cell: where those are sentences, columns are set to the left and may break."""
         return max((len(cell) for row in self.rows for cell in row), default=0)
-
-
-def capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def plain(name: str) -> str:
@@ -46,11 +41,6 @@ def kinds(table: BodyTable, names: Iterable[str]) -> list[str]:
 def listed(parts: Sequence[str]) -> str:
     """``a, b and c``."""
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
-
-
-def intervals(spans: Sequence[tuple[float, float]]) -> str:
-    """Intervals [s]."""
-    return ", ".join(map(format_span, spans))
 
 
 def number(value: float, digits: int = 1, unit: str = "", sign: str = "", unknown: str = "not known") -> str:
