@@ -213,9 +213,7 @@ CASES: list[tuple[Callable[[Files], object], str]] = [
     ),
     (
         lambda f: setattr(
-            f,
-            "session",
-            f.session + QUATS[QUATS.index("[sensors") :].replace("torso", "head") + "offset_s = 99",
+            f, "session", f.session + QUATS[QUATS.index("[sensors") :].replace("torso", "head") + "offset_s = 99"
         ),
         "session.toml: the sensors' clocks do not overlap (torso 0 to 8.99 s, head 99 to 107.99 s)",
     ),

@@ -241,19 +241,13 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
     ("arguments", "said"),
     [
         (["-o", "d", "--format", "lerobot", "--episodes", "reachh"], "it has no such phase; did you mean 'reach'?"),
-        (
-            ["-o", "d", "--format", "lerobot", "--episodes", "later"],
-            "the trajectory follows none of it",
-        ),
+        (["-o", "d", "--format", "lerobot", "--episodes", "later"], "the trajectory follows none of it"),
         (["-o", "d", "--format", "lerobot", "--phase", "reach"], "reach has 2 intervals; choose reach:1"),
         (["-o", "d", "--format", "lerobot", "--rate-hz", "33.3"], "33.3 samples a second"),
         (["-o", "d", "--format", "lerobot", "--interval", "50", "60"], "the recording runs from 1.5 to"),
         (["-o", "x.mcap", "--episodes", "reach"], "--episodes reach: not of format mcap; only of format lerobot"),
         (["-o", "x.mcap", "--instruction", "go"], "--instruction go: not of format mcap; only of format lerobot"),
-        (
-            ["-o", "x.trc"],
-            "is a robot's trajectory, for lerobot",
-        ),
+        (["-o", "x.trc"], "is a robot's trajectory, for lerobot"),
         (["-o", "x.bin", "--format", "mcap"], "name it x.mcap"),
         (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
         (["-o", "d"], "-o d: '' is no format's suffix"),
@@ -264,11 +258,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
     ],
 )
 def test_a_wrong_export_of_a_robot_takes_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    said: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     folders = {name: write_trajectory_folder(tmp_path / name) for name in ("arm", "other")}

@@ -126,9 +126,15 @@ def keeps_its_limits(messages: Sequence[dict[str, Any]], robot: retargeting.Robo
     assert np.abs(mean - 0.5 * (v[1:] + v[:-1])).max() <= hard.max() * dt  # one motion
 
 
-def test_it_approaches_then_follows(arm: retargeting.Robot) -> None:
+@pytest.fixture(scope="module")
+def followed(arm: retargeting.Robot) -> tuple[wp.Pose, Session]:
+    """Twelve seconds of a person who moves, and the robot that follows."""
     pose = person(12.0)
-    run = Session(arm, pose).run(live_poses(pose))
+    return pose, Session(arm, pose).run(live_poses(pose))
+
+
+def test_it_approaches_then_follows(arm: retargeting.Robot, followed: tuple[wp.Pose, Session]) -> None:
+    run = followed[1]
     assert run.states() == ["approach", "follow"]
     began = next(c.clock for c in run.commands if c.state == "follow")
     assert 0.5 < began < 5.0
@@ -140,14 +146,13 @@ def test_it_approaches_then_follows(arm: retargeting.Robot) -> None:
     keeps_its_limits(run.messages(), arm)
 
 
-def test_the_targets_are_those_of_a_recording(arm: retargeting.Robot) -> None:
+def test_the_targets_are_those_of_a_recording(arm: retargeting.Robot, followed: tuple[wp.Pose, Session]) -> None:
     """Of a person who stands both agree; of one who moves but for the delay."""
     still = person(8.0, swing=0.0)
     run = Session(arm, still).run(live_poses(still))
     assert np.allclose(run.hand[-1], retargeting.compute_arm_targets(still, arm).hands[0].position[-1], atol=2e-3)
-    pose = person(12.0)
-    target = retargeting.compute_arm_targets(pose, arm).hands[0].position
-    hand = np.array(Session(arm, pose).run(live_poses(pose)).hand)
+    pose, run = followed
+    target, hand = retargeting.compute_arm_targets(pose, arm).hands[0].position, np.array(run.hand)
     behind = [np.linalg.norm(hand[600 + d : 1100 + d] - target[600:1100], axis=1).mean() for d in range(20)]
     assert 0.03 < DT * int(np.argmin(behind)) < 0.1
     assert min(behind) < 0.006

@@ -355,10 +355,7 @@ WRONG = {
         "'a' hangs in a loop",
     ),
     "two roots": (small(more='<link name="table"/>'), "2 links without a joint above them (root, table)"),
-    "no such link": (
-        small(more=fixed("nowhere", "torso", "0 0 0")),
-        "'torso_fixed' names a link that is not there",
-    ),
+    "no such link": (small(more=fixed("nowhere", "torso", "0 0 0")), "'torso_fixed' names a link that is not there"),
     "twice": (small(more='<link name="torso"/>'), "'torso' occurs 2 times"),
     "planar": (small(more='<link name="x"/>' + fixed("torso", "x", "0 0 0", "planar")), "of type 'planar'"),
     "zero axis": (small(elbow=HINGE.replace("0 1 0", "0 0 0")), "axis [0.0, 0.0, 0.0]"),

@@ -110,9 +110,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert re.search(r"before .* right elbow flexion rising +7 .* 1\.00", printed)
     assert "low-passed at 6 Hz" in printed
     tables = read_tables(out)
-    assert set(tables) == {
-        *("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison"),
-    }
+    assert set(tables) == {*("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison")}
     assert tables["sessions"].select("session", "n", "low_pass_hz").rows() == [("before", 7, 6.0), ("after", 7, 6.0)]
     elbow = (pl.col("joint") == "right_elbow") & (pl.col("angle") == "flexion")
     repetitions = tables["repetitions"].filter(elbow & (pl.col("session") == "before"))
@@ -146,11 +144,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     for picture in ("repetitions", "curves-elbow", "curves-shoulder", "curves-thorax", "angles-1", "angles-2"):
         ET.fromstring((out / f"{picture}.svg").read_text(encoding="utf-8"))
     page = (out / "angles.html").read_text(encoding="utf-8")
-    for words in (
-        "−6 dB",
-        "Z-X-Y",
-        "after less before",
-    ):
+    for words in ("−6 dB", "Z-X-Y", "after less before"):
         assert words in page
     assert re.search(r"the range of [\w ]+, [\w ]+ \((before|after)\) varies most", page)
     cells = [page.index(f"<td>{angle}</td>") for angle in ("thorax, extension", "right elbow, flexion")]

@@ -33,36 +33,25 @@ from wepose_pin.body.configuration import compute_pose
 THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
 SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")
 
-TABLE = """
+LEFT = """
 urdf = "legs.urdf"
 [segments]
 pelvis = { spine = true, labels = "pelvis|sacrum" }
 left_thigh = { labels = "thigh|femur" }
 left_shank = { labels = "shank|tibia" }
 left_foot = { along = "+x", without_sensor = "rigid", labels = "foot" }
-right_thigh = { labels = "thigh|femur" }
-right_shank = { labels = "shank|tibia" }
-right_foot = { along = "+x", without_sensor = "rigid", labels = "foot" }
 [points]
 left_hip = "left_thigh"
 left_knee = "left_shank"
 left_ankle = "left_foot"
 left_toe = "left_toe"
-right_hip = "right_thigh"
-right_knee = "right_shank"
-right_ankle = "right_foot"
-right_toe = "right_toe"
 [lengths]
 hip_width = { segment = "pelvis", from = "right_hip", to = "left_hip" }
 left_thigh = { segment = "left_thigh", from = "left_hip", to = "left_knee" }
 left_shank = { segment = "left_shank", from = "left_knee", to = "left_ankle" }
 left_foot = { segment = "left_foot", from = "left_ankle", to = "left_toe" }
-right_thigh = { segment = "right_thigh", from = "right_hip", to = "right_knee" }
-right_shank = { segment = "right_shank", from = "right_knee", to = "right_ankle" }
-right_foot = { segment = "right_foot", from = "right_ankle", to = "right_toe" }
 [hinges]
 left_knee = { on = "left_thigh", moves = "left_shank", axis = [0.0, 1.0, 0.0], range_deg = [-10.0, 150.0] }
-right_knee = { on = "right_thigh", moves = "right_shank", axis = [0.0, 1.0, 0.0], range_deg = [-10.0, 150.0] }
 [pairs]
 left_thigh = "right_thigh"
 left_shank = "right_shank"
@@ -79,6 +68,10 @@ limbs = [
 ]
 paths = ["left_toe", "right_toe"]
 """
+TABLE = "".join(
+    line + line.replace("left", "right") * (line.startswith("left_") and "right" not in line)
+    for line in LEFT.splitlines(keepends=True)
+)
 
 
 def spherical(parent: str, child: str, origin: str) -> str:

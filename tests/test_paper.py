@@ -140,10 +140,7 @@ def test_another_start_pose_is_refused(made: tuple[Person, Simulation, Recording
 
 @pytest.mark.parametrize(
     ("swing", "said"),
-    [
-        (0.0, "the motion does not determine the lengths"),
-        (0.3, r"the gap is least with .* = -?\d+ mm"),
-    ],
+    [(0.0, "the motion does not determine the lengths"), (0.3, r"the gap is least with .* = -?\d+ mm")],
 )
 def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> None:
     """Arms that hang, or swing on their own: the gap cannot close, and arms of no length are its least."""

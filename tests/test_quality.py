@@ -73,20 +73,12 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
     "left and right swapped": (
         lambda r: exchanged(r, *SIDES_EXCHANGED),
         "fail",
-        [
-            (
-                "sensors-exchanged",
-                "left_forearm and right_forearm, left_upper_arm and right_upper_arm",
-                "sides",
-            ),
-        ],
+        [("sensors-exchanged", "left_forearm and right_forearm, left_upper_arm and right_upper_arm", "sides")],
     ),
     "upper arm and forearm exchanged": (
         lambda r: exchanged(r, ("left_upper_arm", "left_forearm")),
         "fail",
-        [
-            ("sensors-exchanged", "left_upper_arm and left_forearm", ""),
-        ],
+        [("sensors-exchanged", "left_upper_arm and left_forearm", "")],
     ),
     "the forearms exchanged": (
         lambda r: exchanged(r, ("left_forearm", "right_forearm")),

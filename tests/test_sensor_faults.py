@@ -55,8 +55,7 @@ def off_by(recording: Recording, made: Simulation, method: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("signals", "value"),
-    [("gyro", 0.0), ("gyro", None), ("accel", None), ("gyro accel", None), ("gyro accel", 0.0)],
+    ("signals", "value"), [("gyro", 0.0), ("gyro", None), ("accel", None), ("gyro accel", None), ("gyro accel", 0.0)]
 )
 def test_a_sensor_that_never_measures_is_refused_by_name(
     signals: str, value: float | None, made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -87,8 +86,7 @@ def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, ma
 
 
 @pytest.mark.parametrize(
-    ("since", "until", "method"),
-    [(9.0, 99.0, "amekf"), (9.0, 99.0, "smekf"), (5.0, 7.4, "smoother")],
+    ("since", "until", "method"), [(9.0, 99.0, "amekf"), (9.0, 99.0, "smekf"), (5.0, 7.4, "smoother")]
 )
 def test_an_arm_whose_sensor_froze_is_where_its_uncertainty_says(
     since: float, until: float, method: str, made: Simulation, tmp_path: Path

@@ -18,6 +18,7 @@ import numpy as np
 import polars as pl
 import pytest
 from conftest import DATA
+from packaging.version import Version
 
 import wepose_pin as wp
 from wepose_pin.commands.command_line import COMMANDS, parse
@@ -262,17 +263,10 @@ def test_the_live_session_of_python_runs(workplace: Path, tmp_path: Path) -> Non
 # Packages ------------------------------------------------------------------------------------------------------------
 
 
-def lower_bounds(lines: list[str], separator: str) -> dict[str, tuple[int, ...]]:
-    """Package → its lowest version, without trailing zeros."""
+def lower_bounds(lines: list[str], separator: str) -> dict[str, Version]:
+    """Package → its lowest version."""
     pairs = (line.partition(separator) for line in lines)
-    return {name.strip().lower(): version_of(version) for name, _, version in pairs if version}
-
-
-def version_of(text: str) -> tuple[int, ...]:
-    numbers = [int(part) for part in text.strip().split(".")]
-    while numbers[-1] == 0:
-        numbers.pop()
-    return tuple(numbers)
+    return {name.strip().lower(): Version(version) for name, _, version in pairs if version}
 
 
 def test_oldest_versions_are_those_of_the_package() -> None:

@@ -128,11 +128,17 @@ def test_the_start_of_a_smooth_motion_is_not_static(rate_hz: float) -> None:
     ends: dict[StaticTest, list[float]] = {StaticTest(): [], PaperTest(): []}
     for seed in range(4):
         sensor = simulate_paper_dynamic(seed, rate_hz)
+        first = slice(0, round(10.0 * rate_hz))
         for test, late in ends.items():
             static = estimate_orientation(
-                sensor.gyro_S, sensor.accel_S, rate_hz, method="smekf", static=(0.5, 4.5), static_test=test
+                sensor.gyro_S[first],
+                sensor.accel_S[first],
+                rate_hz,
+                method="smekf",
+                static=(0.5, 4.5),
+                static_test=test,
             ).static
-            late.append(sensor.time[np.flatnonzero(static & (sensor.time < 10.0))[-1]] - sensor.moving[0])
+            late.append(sensor.time[np.flatnonzero(static)[-1]] - sensor.moving[0])
     assert np.mean(ends[StaticTest()]) < 0.1  # [s]
     assert np.mean(ends[PaperTest()]) > (0.12 if rate_hz > 500.0 else 0.0)
 

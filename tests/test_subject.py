@@ -37,7 +37,7 @@ def test_stature_narrows_the_prior_and_left_follows_right() -> None:
 def test_the_file_gives_back_what_a_calibration_found(tmp_path: Path) -> None:
     """Lengths, mounts, hinges, girdles, how the person stands and how the sensors drift, and the covariance of all."""
     person = wp.simulate_person(3)
-    recording = wp.simulate(person.lengths, seed=3, imperfections=wp.MILD_PRESET, clasp_s=20.0, circles=0).recording()
+    recording = wp.simulate(person.lengths, seed=3, imperfections=wp.MILD_PRESET, clasp_s=10.0, circles=0).recording()
     subject = replace(wp.calibrate(recording, prior=person.prior).subject, name='Ann "A" Ö\n\\', note="by hand")
     subject.save(tmp_path)
     for path in (tmp_path, tmp_path / "subject.toml"):
@@ -123,10 +123,7 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
             "covariance.order: 'girdles.left_shoulder.rest' is not known",
         ),
         ("ALL\n[heading_drift]\ntorso = 1", "heading_drift.torso = 1 is not a table"),
-        (
-            "ALL\n[hinges.middle_elbow]\n" + HINGE.replace("0.5", "1.0"),
-            "hinges: 'middle_elbow' is not known",
-        ),
+        ("ALL\n[hinges.middle_elbow]\n" + HINGE.replace("0.5", "1.0"), "hinges: 'middle_elbow' is not known"),
         (f"ALL\n[hinges.left_elbow]\n{HINGE}", "hinges.left_elbow.axis: no unit vector: length 0.5"),
     ],
 )

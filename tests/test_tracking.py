@@ -16,7 +16,7 @@ from wepose_pin.simulation import Person, simulate
 
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
     """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
-    simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=wp.NOISE_FREE, clasp_s=10.0, circles=1)
+    simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=wp.NOISE_FREE, clasp_s=6.0, circles=1)
     subject = replace(population_subject(), lengths=person.lengths, girdles=simulation.girdles)
     # What observes headings in motion allows for people's errors: it is not as exact as this world, 0.1 deg.
     for open_loop, most_deg in ((True, 0.05), (False, 0.1)):
@@ -28,9 +28,15 @@ def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
             assert attitude.total_rmse < most_deg, name
 
 
+@pytest.fixture(scope="module")
+def minute(person: Person) -> Simulation:
+    """A clasp of twenty seconds and two circles, with the noise of an MTi-3."""
+    return simulate(person.lengths, seed=3, clasp_s=20.0, circles=2)
+
+
 @pytest.mark.parametrize("method", ["amekf", "smoother", "smekf", "smekf_published", "ncf", "gdc"])
-def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person: Person, method: str) -> None:
-    subject = replace(population_subject(), lengths=person.lengths, girdles=simulation.girdles)
+def test_a_noisy_world_is_tracked_by_every_filter(minute: Simulation, person: Person, method: str) -> None:
+    simulation, subject = minute, replace(population_subject(), lengths=person.lengths, girdles=minute.girdles)
     pose = track(simulation.recording(), subject, method=method)
     errors = evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0])
     assert errors.position["right_palm"].mean < 20.0
@@ -39,16 +45,17 @@ def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person
     assert set(summary["sensors"]) == set(simulation.gyro_S)
 
 
+def measure_exactly(recording: Recording, simulation: Simulation) -> dict[str, OrientationSensor]:
+    n, quat_WS = len(recording), simulation.quat_WS
+    return {name: OrientationSensor(quat_WS[name][:n], s.stated_quat_LS) for name, s in recording.sensors.items()}
+
+
 @pytest.mark.parametrize("causal", [False, True])
 def test_exact_measured_orientations_are_used_as_they_are(
     half_minute: Recording, simulation: Simulation, person: Person, causal: bool
 ) -> None:
     """What joined hands show of their headings is less than its own uncertainty; a heading that drifts is corrected."""
-    n, segment = len(half_minute), "left_forearm"
-    sensors = {
-        name: OrientationSensor(simulation.quat_WS[name][:n], sensor.stated_quat_LS)
-        for name, sensor in half_minute.sensors.items()
-    }
+    sensors, segment = measure_exactly(half_minute, simulation), "left_forearm"
     drift = Rotation.from_euler("z", np.interp(half_minute.time, [5.0, 30.0], [0.0, 50.0])[:, None], degrees=True)
     drifting = (drift * Rotation.from_quat(sensors[segment].quat_VS)).as_quat()
     off = {**sensors, segment: replace(sensors[segment], quat_VS=drifting)}
@@ -70,10 +77,7 @@ def test_the_uncertainty_of_measured_orientations_grows_in_gaps(
     n, segment = len(half_minute), "left_forearm"
     gap = np.zeros(n, dtype=bool)
     gap[1500:1700] = True
-    sensors = {
-        name: OrientationSensor(simulation.quat_WS[name][:n], sensor.stated_quat_LS)
-        for name, sensor in half_minute.sensors.items()
-    }
+    sensors = measure_exactly(half_minute, simulation)
     held = sensors[segment].quat_VS.copy()
     held[gap] = held[1499]
     with_gap = {**sensors, segment: replace(sensors[segment], quat_VS=held, gap=gap)}

@@ -15,15 +15,7 @@ from .imperfections import IDEAL_PRESET, MILD_PRESET, PEOPLE_PRESET, PRESETS, Im
 from .imu import MTI_3, NOISE_FREE, ImuNoise
 from .motion import CIRCLING_POINT, SEGMENTS
 from .people import SIDES
-from .subject import (
-    MEASURED_LENGTHS,
-    MEASURED_STD,
-    PEOPLE_MEASURED_STD,
-    Person,
-    Simulation,
-    simulate,
-    simulate_person,
-)
+from .subject import MEASURED_LENGTHS, MEASURED_STD, PEOPLE_MEASURED_STD, Person, Simulation, simulate, simulate_person
 
 __all__ = [
     "ACTIVITIES",
