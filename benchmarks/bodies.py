@@ -28,7 +28,7 @@ from wepose_pin.readers.mvnx import SEGMENT_OF, read_frames
 from wepose_pin.tracking import track
 
 from .ring_chain import RingSession, write_ring_session
-from .tables import Column, Section, Table
+from .tables import Column, Section, Table, rms
 from .ur5_arm import RUNS, write_ur5_session, write_urdf
 
 MODELS = ("upper_body", "humanSubject01_66dof")
@@ -172,7 +172,7 @@ def measure_ur5(data: Path, methods: Sequence[str], folder: Path) -> Table:
                     (Rotation.from_quat(quat[link]) * true.inv()).magnitude()[scored]
                     for quat in (tracked.segments.quat_WL, tracked.quat_WL)
                 ]
-                errors.append([float(np.degrees(np.sqrt(np.mean(angle**2)))) for angle in off])
+                errors.append([float(np.degrees(rms(angle))) for angle in off])
                 table.rows[f"{method} {name} {link}"] = dict(zip(("alone_deg", "chain_deg"), errors[-1], strict=True))
         table.rows[f"{method} mean"] = dict(zip(("alone_deg", "chain_deg"), np.mean(errors, axis=0), strict=True))
     return table

@@ -24,19 +24,14 @@ from wepose_pin.simulation import (
 from wepose_pin.simulation.activities import ACTIVITIES
 from wepose_pin.tracking import TrackResult, track
 
-from .tables import Column, Section, Table
+from .tables import Column, Section, Table, rms
 
 GOOD = MTI_3  # 0.007 deg/s/√Hz, 10 deg/h
 POOR = replace(MTI_3, gyro_density=np.deg2rad(0.03), gyro_bias_instability=np.deg2rad(100.0) / 3600.0)
 GYROSCOPES = {"good": GOOD, "poor": POOR, "perfect": NOISE_FREE}
 # With perfect gyroscopes nothing else of a sensor is wrong either: what remains of a heading's error is the person's.
-PERFECT_SENSOR = {
-    name: getattr(Imperfections(), name)
-    for name in (
-        *("gyro_scale", "accel_scale", "misalignment_deg", "g_sensitivity_deg_s", "gyro_warm_up_deg_s", "dropped"),
-        *("gyro_range_deg_s", "accel_range_g", "bits", "clock_jitter", "clock_offset", "clock_drift_ppm"),
-    )
-}
+_SENSOR = ("gyro_", "accel_", "misalignment", "g_sensitivity", "bits", "clock_", "dropped")
+PERFECT_SENSOR = {name: size for name, size in vars(Imperfections()).items() if name.startswith(_SENSOR)}
 WAYS = ("open", "offline", "causal")
 SECONDS = 60.0
 SCORED_FROM_S = 8.0  # the activity has begun
@@ -119,9 +114,9 @@ def measure_case(case: Case, seeds: range) -> dict[str, float]:
         for way in WAYS:
             tracked = track(recording, model=body, open_loop=way == "open", causal=way == "causal")
             errors, stds = find_heading_errors(simulation, tracked)
-            figures.setdefault(way, []).append(float(np.degrees(np.sqrt(np.mean(errors**2)))))
-            figures.setdefault(f"{way}_by_std", []).append(float(np.sqrt(np.mean((errors / stds) ** 2))))
-    return {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in figures.items()}
+            figures.setdefault(way, []).append(float(np.degrees(rms(errors))))
+            figures.setdefault(f"{way}_by_std", []).append(rms(errors / stds))
+    return {name: rms(np.array(values)) for name, values in figures.items()}
 
 
 def simulate_case(case: Case, seed: int) -> Simulation:

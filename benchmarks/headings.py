@@ -29,7 +29,7 @@ from wepose_pin.simulation.signals import Wander, make_pulse
 from wepose_pin.tracking import Tracker, TrackResult, track, track_chunks
 from wepose_pin.tracking.headings import HeadingCorrection
 
-from .tables import Column, Section, Table
+from .tables import Column, Section, Table, rms
 
 PERSONS, SECONDS = 5, 600.0
 FEW_PERSONS, FEW_SECONDS = 2, 120.0
@@ -132,8 +132,8 @@ def measure_headings(name: str, preset: Imperfections, persons: int, seconds: fl
             for joint, (_, error, _) in compare_headings(simulation, tracked, segments=True).items():
                 squares[joint].setdefault(f"segment_{way}", []).append(float(np.mean(error**2)))
     for joint, columns in squares.items():
-        rms = {key: float(np.sqrt(np.mean(values))) for key, values in columns.items()}
-        table.rows[joint] = {key: value if "by_std" in key else np.degrees(value) for key, value in rms.items()}
+        roots = {key: float(np.sqrt(np.mean(values))) for key, values in columns.items()}
+        table.rows[joint] = {key: value if "by_std" in key else np.degrees(value) for key, value in roots.items()}
     return table
 
 
@@ -215,12 +215,12 @@ def measure_live_headings(minutes: float) -> Table:
         for way, by_joint in errors.items():
             _, error, std = by_joint[joint]
             row = table.rows.setdefault(joint, {})
-            row |= {way: np.degrees(_rms(error)), f"{way}_by_std": _rms(error / std)}
+            row |= {way: np.degrees(rms(error)), f"{way}_by_std": rms(error / std)}
     for begin, end in pairwise(np.arange(0.0, recording.time[-1] + EVERY_S, EVERY_S).tolist()):
         row = {}
         for way, by_joint in errors.items():
             values = [error[(time >= begin) & (time < end)] for time, error, _ in by_joint.values()]
-            row[way] = np.degrees(_rms(np.concatenate(values))) if len(values[0]) > SCORED_HZ * CHUNK_S else np.nan
+            row[way] = np.degrees(rms(np.concatenate(values))) if len(values[0]) > SCORED_HZ * CHUNK_S else np.nan
         table.rows[f"all, {begin / 60.0:.0f} to {end / 60.0:.0f} min"] = row
     return table
 
@@ -238,7 +238,3 @@ def calibrate_person(person: Person, simulation: Simulation) -> Subject:
     order = (*prior.order, *(row for name in mounts for row in mount_rows(name)))
     joint = block_diag(covariance, np.diag(np.tile(np.square(MOUNT_STD), len(mounts))))
     return replace(prior, name="calibrated", lengths=lengths, mounts=mounts, order=order, covariance=joint)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

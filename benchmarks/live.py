@@ -93,17 +93,12 @@ def measure_live_session(seconds: float) -> Table:
         from wepose_pin.body import load_model
         from wepose_pin.live.page import LivePage
 
-        page = LivePage(load_model())
-        page.open()
-        with _reader(page.url):
-            table.rows["and page, with a browser"] = _measure(recording, Path(folder) / "b.mcap", [page])
-            robot = _connect_robot(recording, Path(folder))
+        for row, file in (("and page, with a browser", "b.mcap"), ("and a robot's arm, UDP", "c.mcap")):
+            outputs = [UdpOutput("9"), _connect_robot(recording, Path(folder))] if "robot" in row else []
             page = LivePage(load_model())
             page.open()
             with _reader(page.url):
-                outputs = [page, UdpOutput("9"), robot]
-                row = "and a robot's arm, UDP"
-                table.rows[row] = _measure(recording, Path(folder) / "c.mcap", outputs)
+                table.rows[row] = _measure(recording, Path(folder) / file, [page, *outputs])
     table.notes.append(
         "Latency is from the moment at which the newest sample was due to its pose. Limits: p50 under "
         f"{LATENCY_MS:g} ms, p99 {LATENCY_99_MS:g} ms, under {SHARE:g} % of one core, no sample lost, memory flat."

@@ -62,25 +62,10 @@ title = "points of the chain by an optical system"
 phase = "motion"
 seconds = 60
 do = "Move the chain."
-[[closure]]
-phase = "motion"
-kind = "recorded"
-points = ["tip"]
-origin = "ball"
-slip = 0.001
-[[closure]]
-phase = "motion"
-kind = "recorded"
-points = ["ball"]
-origin = "head"
-slip = 0.001
-[[closure]]
-phase = "motion"
-kind = "recorded"
-points = ["end"]
-origin = "tip"
-slip = 0.001
-"""
+""" + "".join(
+    f'[[closure]]\nphase = "motion"\nkind = "recorded"\npoints = ["{point}"]\norigin = "{origin}"\nslip = 0.001\n'
+    for point, origin in (("tip", "ball"), ("ball", "head"), ("end", "tip"))
+)
 
 
 class RingSession(NamedTuple):

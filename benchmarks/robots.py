@@ -75,7 +75,9 @@ def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float,
             with contextlib.redirect_stdout(io.StringIO()):
                 summary = retarget(result, robot=name, out=Path(folder) / name, interval=interval, view=False).result
             wall = time.process_time() - begin
-            common = _name_margins(summary["limit_margins"]) | {
+            margins = summary["limit_margins"]
+            common = {key: 100.0 * margins[f"{key}_share"] for key in ("velocity", "acceleration", "jerk")} | {
+                "position": margins["position_rad"],
                 "infeasible": 100.0 * summary["steps"]["stopping_share"],
                 "closest": summary["self_collisions"]["min_hull_distance_mm"] or np.nan,
                 "collisions": summary["self_collisions"]["samples"],
@@ -86,11 +88,6 @@ def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float,
                 error = arm["hand_error_mm"]
                 table.rows[f"{name} {side}"] = {"hand": error["median"], "hand_90": error["p90"]} | common
     return table
-
-
-def _name_margins(margins: dict[str, float]) -> dict[str, float]:
-    shares = {key: 100.0 * margins[f"{key}_share"] for key in ("velocity", "acceleration", "jerk")}
-    return {"position": margins["position_rad"]} | shares
 
 
 def measure_live(session: Path, robots: Sequence[str], interval: tuple[float, float] | None) -> Table:

@@ -66,6 +66,11 @@ def time_in_turn(
     }
 
 
+def rms(values: np.ndarray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def is_installed(peer: str) -> bool:
     """Whether a peer is installed."""
     return importlib.util.find_spec(peer) is not None

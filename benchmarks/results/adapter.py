@@ -44,12 +44,8 @@ NOT_COMPARED = ("*.html", "*.md", "*.svg", "provenance.json", "*.provenance.json
 VOLATILE = r"(^|/)(provenance|versions|packages|machine|date|solve_ms)(/|$)|/results/(seconds|memory_mb|\w+_s)$"
 MAIN_TABLES = ("pose",)  # files whose columns stand under the result's own key
 
-# Where the inputs of an older version are read: what has another name now. Pattern → replacement, line by line of its
-# TOML files, and by columns of its truth tables.
+# Where the inputs of an older version are read: what has another name now, line by line of its TOML files.
 SESSION_KEYS: dict[str, str] = {r"^still = ": "static = ", "^strapping = .new.": "remounted = true"}
-TRUTH_COLUMNS: dict[str, str] = {}
-
-_PHASES: dict[str, str] = {}  # our phase → the project's, where they differ
 
 
 # Sessions ----------------------------------------------------------------------------------------------------------
@@ -147,7 +143,7 @@ def write_session(folder: Path, session: Session) -> None:
         pl.DataFrame(dict(session.truth)).write_parquet(folder / "truth.parquet")
     if session.phases:
         lines.append("[phases]")
-        lines += [f"{_PHASES.get(name, name)} = {[list(span) for span in s]}" for name, s in session.phases.items()]
+        lines += [f"{name} = {[list(span) for span in s]}" for name, s in session.phases.items()]
     if session.joints:
         lines += ["[joints]", *(f"{name} = {value!r}" for name, value in session.joints.items())]
     for k, table in enumerate(session.tables):
@@ -178,17 +174,10 @@ def copy_inputs(source: Path, target: Path) -> None:
     """The inputs of another version, in the words of this one."""
     shutil.copytree(source, target)
     for path in target.rglob("*.toml"):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        path.write_text("\n".join(_replaced(line, SESSION_KEYS) for line in lines) + "\n", encoding="utf-8")
-    for path in target.rglob("truth.parquet"):
-        frame = pl.read_parquet(path)
-        frame.rename({name: _replaced(name, TRUTH_COLUMNS) for name in frame.columns}).write_parquet(path)
-
-
-def _replaced(text: str, table: Mapping[str, str]) -> str:
-    for pattern, replacement in table.items():
-        text = re.sub(pattern, replacement, text)
-    return text
+        text = path.read_text(encoding="utf-8")
+        for pattern, replacement in SESSION_KEYS.items():
+            text = re.sub(pattern, replacement, text, flags=re.MULTILINE)
+        path.write_text(text, encoding="utf-8")
 
 
 # Commands ----------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -37,6 +38,7 @@ from wepose_pin.simulation import (
 from wepose_pin.simulation import PRESETS as SIZES
 from wepose_pin.tracking import track
 
+from ..tables import rms
 from .contenders import DEFAULT, OURS, Contender, list_contenders
 from .experiment import Job, Result, align_rotation
 from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
@@ -176,16 +178,8 @@ def _upper_body(seed: int, preset: str) -> list[Result]:
     exact, stated = set_exact_mounts(person.prior, simulation), person.prior
     results = []
 
-    def score(
-        label: str,
-        recording: Recording,
-        subject: Subject,
-        method: str,
-        *,
-        open_loop: bool = False,
-        causal: bool = False,
-    ) -> None:
-        pose = track(recording, subject, method=method, open_loop=open_loop, causal=causal).pose
+    def score(label: str, recording: Recording, subject: Subject, method: str, **options: Any) -> None:
+        pose = track(recording, subject, method=method, **options).pose
         figures = collect_hand_errors(evaluate(pose, truth, circles)) | compare_lengths(subject, person)
         results.append(Result(label, figures))
 
@@ -229,9 +223,9 @@ def _compare_mounts(subject: Subject, person: Person, simulation: Simulation) ->
     stated = [[subject.std(row) for row in mount_rows(name)] for name in simulation.quat_LS]
     lengths = [(subject.lengths[n] - person.lengths[n]) / subject.std(n) for n in list_closed_lengths(load_table())]
     return {
-        "headings rms [deg]": float(np.degrees(_rms(errors[:, 2]))),
-        "tilts rms [deg]": float(np.degrees(_rms(errors[:, :2]))),
-        "error / ± rms": _rms(np.concatenate([lengths, (errors / stated).ravel()])),
+        "headings rms [deg]": float(np.degrees(rms(errors[:, 2]))),
+        "tilts rms [deg]": float(np.degrees(rms(errors[:, :2]))),
+        "error / ± rms": rms(np.concatenate([lengths, (errors / stated).ravel()])),
     }
 
 
@@ -313,11 +307,7 @@ def collect_hand_errors(errors: Evaluation) -> dict[str, float | tuple[float, fl
 def compare_lengths(subject: Subject, person: Person) -> dict[str, float]:
     """Compute the error of the lengths that the closed chain observes."""
     errors = [subject.lengths[name] - person.lengths[name] for name in list_closed_lengths(load_table())]
-    return {"lengths rms [mm]": 1e3 * _rms(np.array(errors))}
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return {"lengths rms [mm]": 1e3 * rms(np.array(errors))}
 
 
 def list_closed_lengths(table: BodyTable) -> list[str]:
