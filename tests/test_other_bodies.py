@@ -68,10 +68,7 @@ limbs = [
 ]
 paths = ["left_toe", "right_toe"]
 """
-TABLE = "".join(
-    line + line.replace("left", "right") * (line.startswith("left_") and "right" not in line)
-    for line in LEFT.splitlines(keepends=True)
-)
+TABLE = re.sub(r"(?m)(^left_(?!.*right).*\n)+", lambda lines: lines[0] + lines[0].replace("left", "right"), LEFT)
 
 
 def spherical(parent: str, child: str, origin: str) -> str:
