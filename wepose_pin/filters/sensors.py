@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
@@ -44,19 +44,18 @@ def check_method(method: str) -> str:
     return method
 
 
-# Binds a filter and its static test to samples (n, 3) and to an `Orientation` that their calls fill.
-_Bind = Callable[[np.ndarray, np.ndarray, Orientation], list[Callable[[], None]]]
+_Records = tuple[np.ndarray, ...]
 
 
-def _bind_later(
-    filter_: OrientationFilter, records: tuple[np.ndarray, ...], static_records: tuple[np.ndarray, ...]
-) -> _Bind:
-    def bind(gyro_S: np.ndarray, accel_S: np.ndarray, out: Orientation) -> list[Callable[[], None]]:
-        samples, covariances = (gyro_S, accel_S, out.static), (out.attitude_cov, out.about_vertical)
-        filled = (out.quat_VS, out.gyro_bias, *(covariances if filter_.has_covariance else ()))
-        return [partial(find_static, *static_records, *samples), partial(filter_.run, *records, *samples, *filled)]
-
-    return bind
+def _bind(
+    filter_: OrientationFilter, records: tuple[_Records, _Records], samples: Sequence[np.ndarray], out: Orientation
+) -> list[Callable[[], None]]:
+    """Return the calls of a filter's static test and of its run, which fill `out` from `samples` gyro_S, accel_S."""
+    filled = (out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical)[: 4 if filter_.has_covariance else 2]
+    return [
+        partial(find_static, *records[0], *samples, out.static),
+        partial(filter_.run, *records[1], *samples, out.static, *filled),
+    ]
 
 
 class SensorFilters:
@@ -95,7 +94,7 @@ class SensorFilters:
         if METHODS[method] is PUBLISHED_SMEKF:
             self._test = replace(self._test, rate_stds=np.inf)
         self.names, self._noises = tuple(noises), dict(noises)
-        self._filters: dict[str, _Bind] = {}
+        self._records: dict[str, tuple[_Records, _Records]] = {}  # of the static test and of the filter
         k = len(self.names)
         self._now = make_orientation(k, TYPICAL, covariance=METHODS[method].has_covariance)
         self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
@@ -137,7 +136,7 @@ class SensorFilters:
         calls: list[Callable[[], None]] = []
         for i, name in enumerate(self.names):
             gyro_S, accel_S, now = self._gyro_S[i : i + 1], self._accel_S[i : i + 1], self._now.take(slice(i, i + 1))
-            calls += self._filters[name](gyro_S, accel_S, now)
+            calls += _bind(METHODS[self._method], self._records[name], (gyro_S, accel_S), now)
         return calls
 
     def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
@@ -146,13 +145,14 @@ class SensorFilters:
         if sensor.gap is not None:
             # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
             gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
-        begin, cov = 0, None
-        out = make_orientation(len(gyro_S), self._noises[name], covariance=METHODS[self._method].has_covariance)
-        if name not in self._filters:
+        begin, cov, filter_ = 0, None, METHODS[self._method]
+        out = make_orientation(len(gyro_S), self._noises[name], covariance=filter_.has_covariance)
+        if name not in self._records:
             begin = self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range, out)
         if self._method in OFFLINE and out.attitude_cov is not None:  # forward over all samples
             begin, cov = 0, out.attitude_cov[:begin].copy()
-        for call in self._filters[name](gyro_S[begin:], accel_S[begin:], out.take(slice(begin, None))):
+        rest = out.take(slice(begin, None))
+        for call in _bind(filter_, self._records[name], (gyro_S[begin:], accel_S[begin:]), rest):
             call()
         if cov is not None and out.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
@@ -169,16 +169,14 @@ class SensorFilters:
             tilt_std = MOVING_TILT_STD
         first = int(phase.start)
 
-        def start(
-            method: str, noise: SensorNoise, quat_VS: np.ndarray, static_records: tuple[np.ndarray, ...]
-        ) -> _Bind:
+        def make(method: str, noise: SensorNoise, quat_VS: np.ndarray) -> _Records:
             filter_, params = METHODS[method], self._params
             if filter_.params_type in (AmekfParams, SmekfParams):
                 params = params or filter_.params_type(tilt_std=tilt_std)
                 params = replace(params, gyro_range=gyro_range) if gyro_range < params.gyro_range else params
             elif params is None and filter_.params_type is not None:
                 params = filter_.params_type()
-            return _bind_later(filter_, filter_.make_records(noise, rate_hz, quat_VS, params), static_records)
+            return filter_.make_records(noise, rate_hz, quat_VS, params)
 
         static_records = make_static_records(noise, rate_hz, self._test)
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
@@ -189,7 +187,8 @@ class SensorFilters:
             run = make_orientation(first, mirrored, covariance=METHODS[method].has_covariance)
             backward = tuple(record.copy() for record in static_records)
             backward[0]["bias"] *= -1.0
-            for call in start(method, mirrored, rotations.turned(quat_VS, turn), backward)(gyro, accel, run):
+            records = backward, make(method, mirrored, rotations.turned(quat_VS, turn))
+            for call in _bind(METHODS[method], records, (gyro, accel), run):
                 call()
             for field, values in run.sampled().items():
                 getattr(out, field)[:first] = values[::-1]
@@ -199,7 +198,7 @@ class SensorFilters:
             if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
                 turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
                 quat_VS, tilt_std = rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD
-        self._filters[name] = start(self._method, noise, quat_VS, static_records)
+        self._records[name] = static_records, make(self._method, noise, quat_VS)
         return first
 
 

@@ -5,16 +5,21 @@ sensors' own times), `gaps` (lost samples, resampling), of a file; `arrivals` of
 `faults` and `plausibility` say whether the sensors measured, by the `limits` of what sensors can.
 """
 
-from .intervals import (
+from .recording import (
+    CONFIGURATION,
+    EACH_TIME,
     Intervals,
+    Mark,
+    Recording,
     check_phases,
+    check_recording,
     check_selection,
     check_time,
     format_span,
     format_time,
+    join_recordings,
     select_interval,
 )
-from .recording import CONFIGURATION, EACH_TIME, Mark, Recording, check_recording, join_recordings
 from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
 __all__ = [

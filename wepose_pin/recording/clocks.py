@@ -9,8 +9,8 @@ import numpy as np
 
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData
-from .intervals import check_time, format_span
 from .limits import LONGEST_STEP_S, SHORTEST_STEP_S
+from .recording import check_time, format_span
 
 LONGEST_GAP_S = 0.05  # [s] of lost samples that are bridged silently
 # Relative deviation of a step from the usual one that means an uneven clock or a lost row; devices jitter less.

@@ -17,8 +17,8 @@ from ..compilation import inlined, kernel
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from .gaps import find_runs
-from .intervals import format_time
 from .limits import NARROWEST_GYRO_RANGE
+from .recording import format_time
 
 # Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5
