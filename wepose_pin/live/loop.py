@@ -255,27 +255,27 @@ class LiveLoop(Stage):
     # The state -------------------------------------------------------------------------------------------------------
 
     def build_status(self) -> Status:
-        sensors, tracker, clock = self.source.sensors, self._tracker, self._stream.clock
-        now, counts, frozen = self.source.clock(), clock.counts, clock.frozen.copy()
+        sensors, clock, heading_std = self.source.sensors, self._stream.clock, self._heading_std.tolist()
+        now, frozen = self.source.clock(), clock.frozen.copy()
         rates = self._monitor.update(now)
         lost = np.isin(sensors, self._monitor.list_silent(sensors, now, MAX_SILENCE_S)) | frozen | clock.lost
-        problems, statuses = dict(self.source.problems), []
-        for i, name in enumerate(sensors):
-            status = SensorStatus(name, rates.get(name, 0.0), bool(lost[i]), frozen=bool(frozen[i]))
-            if self._stream.has_begun:
-                status = status._replace(missing=int(counts[i, MISSING]))
-            if self._is_tracking:
-                static, bias = bool(tracker.static[i]), tuple(tracker.gyro_bias[i].tolist())
-                status = status._replace(static=static, gyro_bias=bias, heading_std=float(self._heading_std[i]))
-            statuses.append(status)
-            if counts[i, CUT_OFF]:
-                problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = int(counts[i, CUT_OFF])
+        static, bias = np.zeros(len(sensors), dtype=bool), np.full((len(sensors), 3), np.nan)
+        if self._is_tracking:
+            static, bias = self._tracker.static, self._tracker.gyro_bias
+        missing = clock.counts[:, MISSING].tolist() if self._stream.has_begun else [None] * len(sensors)
+        known = lost.tolist(), static.tolist(), map(tuple, bias.tolist()), heading_std, missing, frozen.tolist()
+        rows = zip(sensors, *known, strict=True)
+        statuses = tuple(SensorStatus(name, rates.get(name, 0.0), *row) for name, *row in rows)
+        problems = dict(self.source.problems)
+        for name, count in zip(sensors, clock.counts[:, CUT_OFF].tolist(), strict=True):
+            if count:
+                problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = count
         problems |= {self.log.problem: 1} if self.log.problem else {}
         recorded_s = 0.0 if self.log.path is None else max(0.0, clock.newest - clock.begin)
         latency = list(itertools.islice(reversed(self._latency), SHOWN_LATENCIES)) or [0.0]
         p50, p99 = (1e3 * np.quantile(latency, (0.5, 0.99))).tolist()
         description = self._describe_state(lost, frozen)
-        return Status(*description, now, tuple(statuses), (p50, p99), recorded_s, problems, self.actions)
+        return Status(*description, now, statuses, (p50, p99), recorded_s, problems, self.actions)
 
     def _describe_state(self, lost: np.ndarray, frozen: np.ndarray) -> tuple[str, str, float]:
         """Return the state, the message to the person, and the progress of the start pose."""

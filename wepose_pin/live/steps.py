@@ -149,9 +149,9 @@ def assign_segments(guide: Guide, asked_for: bool) -> StepRun:
 def measure_shakes(guide: Guide) -> dict[str, float]:
     """Measure each sensor's rms rate [rad/s] over its newest `SHAKE_WINDOW_S`, where it has sent for so long."""
     rates = {}
-    for sensor in guide.monitor.sending:
+    for sensor, newest in guide.monitor.sending.items():
         _, time_s, gyro_S, accel_S = guide.monitor.collect(sensor, SHAKE_WINDOW_S)
-        if np.ptp(time_s) < 0.75 * SHAKE_WINDOW_S:
+        if guide.now - newest > SHAKE_WINDOW_S or np.ptp(time_s) < 0.75 * SHAKE_WINDOW_S:
             continue
         rate = np.linalg.norm(gyro_S, axis=1)
         if sensor in guide.source.orientations:  # from each orientation to the next
@@ -168,6 +168,7 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
     reason, guide.reason = guide.reason, ""
     starts = [(step.seconds, step.do) for step in protocol.steps if step.phase == "start"]
     seconds, do = starts[0] if starts else (START_POSE_S, "Stand still in the start pose.")
+    do = " ".join(do.split())
     while True:
         asked = None
         while asked is not READY:
@@ -226,7 +227,7 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
                     estimate = future.result()
                 future = None
             view = GuideView(
-                motion.do,
+                " ".join(motion.do.split()),
                 guide.describe_problems() if guide.silent else "",
                 None if running else max(0.0, begin - guide.now),
                 max(0.0, target_s - done_s),
