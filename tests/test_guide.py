@@ -24,7 +24,7 @@ from wepose_pin import Calibration, Recording, calibrate, load_model, load_sessi
 from wepose_pin.commands.live import live
 from wepose_pin.live import Output, Request, SensorSetup, Status
 from wepose_pin.live.guide import Guide, GuideOptions
-from wepose_pin.live.steps import make_steps
+from wepose_pin.live.steps import make_steps, measure_phase
 from wepose_pin.readers.live_log import read_live_log
 
 CLASP = Path(__file__).parents[1] / "calibration" / "clasp.toml"
@@ -153,7 +153,7 @@ def test_sensors_that_measure_orientations_are_shaken_and_calibrated_too(tmp_pat
 
 def begin(session: Session, phase: str, seconds: float) -> None:
     """Follow the guide until so many seconds of a phase are recorded."""
-    session.run(lambda m: m.step == phase and session.guide.attempt.measured_s(phase) >= seconds)
+    session.run(lambda m: m.step == phase and measure_phase(session.guide.attempt, phase) >= seconds)
 
 
 def test_who_moves_in_the_start_pose_is_told_which_sensor_moved(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_a_short_loss_is_bridged_and_a_long_one_needs_the_start_pose_again(tmp_p
     assert note == "No samples from left forearm. Switched on and in reach?"
     session.person.silent = set()
     begin(session, "clasp", 8.0)
-    ((first, last),) = session.guide.attempt.recording().phases["clasp"]
+    ((first, last),) = session.guide.attempt.make_recording().phases["clasp"]
     assert last - first >= 8.0
     # All are silent for ten seconds, as when the laptop sleeps.
     session.source.asleep_s = 10.0
@@ -223,8 +223,8 @@ def test_a_short_loss_is_bridged_and_a_long_one_needs_the_start_pose_again(tmp_p
     assert note == "No samples from any sensor. Switched on and in reach? Headings were lost: begin once more."
     assert session.guide.segments == session.person.worn
     session.run(lambda m: m.step == "clasp")
-    assert session.guide.attempt.path.name == "calibration-1.mcap"
-    assert set(session.guide.attempt.recording().phases) == {"start"}
+    assert session.guide.attempt.log.path.name == "calibration-1.mcap"
+    assert set(session.guide.attempt.make_recording().phases) == {"start"}
     session.guide.close()
 
 
@@ -284,7 +284,7 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     assert (session.guide.step.name, session.guide.segments) == ("assignment", {})
     session.run(lambda m: m.step == "start")
     assert session.guide.segments == worn
-    assert session.guide.attempt.path.name == "calibration-2.mcap"  # of other sensors
+    assert session.guide.attempt.log.path.name == "calibration-2.mcap"  # of other sensors
     session.guide.close()
 
 
@@ -292,7 +292,7 @@ def test_more_motion_is_of_the_longest_part_of_a_joined_protocol(tmp_path: Path)
     session = Session(tmp_path, protocol="clasp+t_pose")
     guide = session.guide
     session.run(lambda m: bool(m.view.quality))
-    assert set(guide.attempt.recording().phases) == {"start", "clasp", "t_pose"}
+    assert set(guide.attempt.make_recording().phases) == {"start", "clasp", "t_pose"}
     guide.ask(Request("more"))
     assert guide.step.name == "clasp"
     guide.close()

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,19 +30,17 @@ from ..calibration.protocols import BOW, GUIDED, split_protocol
 from ..errors import BadOption
 from ..filters import BEST
 from ..readers import load_session
-from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
 from ..report.calibration import render_calibration_report
 from ..report.page import write_pages
 from ..simulation import simulate
 from ..writers.calibration import write_calibration
-from ..writers.live_log import LiveLog
 from ..writers.provenance import collect_provenance, result_folder
-from .setup import AssignedSource, SensorSetup, write_segments
+from .setup import AssignedSource, SensorSetup, rename_sensors, write_segments
 from .sources.base import Source
 from .state import Action, GuideStep, GuideView, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
-from .ticks import SensorMonitor, TickStream
+from .ticks import Recorder, SensorMonitor
 
 STATURE = "stature"  # that may be measured in place of a length
 SUBJECT_FILES = ("subject.toml", "subject.urdf", "calibration.json", "report.html")
@@ -74,7 +72,7 @@ class GuideOptions:
 
     def calibrate(self, source: Recording | Path, entered: Mapping[str, float] = MappingProxyType({})) -> Calibration:
         """Calibrate a recording, with lengths [m] that the person has `entered`; that of a file is saved beside it."""
-        recording = source if isinstance(source, Recording) else load_session(source)
+        recording = check_recording(source) if isinstance(source, Recording) else load_session(source)
         measured, protocol = {**self.measured, **entered}, choose_parts(self.protocol, recording.phases)
         calibration = calibrate(
             recording,
@@ -137,7 +135,7 @@ class Guide(Stage):
         self.now, self.text = 0.0, ""  # [s] on the source's clock; what the person typed for the action
         self.ticks: list[Ticks] = []  # of the attempt, that came since the step has last yielded
         self.segments: dict[str, str] = {}  # sensor → segment that it is assigned to
-        self.attempt: Attempt | None = None  # the recording; None before it begins
+        self.attempt: Recorder | None = None  # None before it begins
         self.measured: dict[str, float] = {}  # lengths [m] that the person entered
         self.reason = ""  # for which the person must begin again from the start pose
         self.accepted: Calibration | None = None
@@ -178,7 +176,7 @@ class Guide(Stage):
             self._postponed += samples
             if self.step.records:
                 postponed, self._postponed = self._postponed, []
-                self.ticks = self.attempt.push(postponed)
+                self.ticks = [*self.attempt.push(rename_sensors(postponed, self.segments))]
         self._go_on(None)
         now = time.monotonic()
         if self._figure is not None and now >= self._figure_due:
@@ -214,25 +212,26 @@ class Guide(Stage):
             except StopIteration as ended:  # there is nothing to do in it
                 name = ended.value
 
-    def begin_attempt(self) -> Attempt:
+    def begin_attempt(self) -> Recorder:
         """Begin to record, unless a recording of these sensors runs."""
         if self.attempt is None:
             paths = (self.options.folder / f"calibration-{number}.mcap" for number in itertools.count(1))
-            path = next(path for path in paths if not path.exists())
-            self.attempt, self._postponed = Attempt(path, self.assign_source(), self.options), []
+            path, source = next(path for path in paths if not path.exists()), self.assign_source()
+            header = replace(self.options.setup, remounted=True).header(source.sensors, source.orientations)
+            self.attempt = Recorder(source, header | {"method": self.options.method}, path)
+            self._postponed = []
         return self.attempt
 
     def assign_source(self) -> AssignedSource:
         """The source with the sensors named by their segments."""
         return AssignedSource(self.source, self.segments, self.options.model.table.segments, is_open=True)
 
-    def accept(self, calibration: Calibration) -> None:
-        """Save the subject of the attempt's calibration, and end."""
+    def accept(self, calibration: Calibration, result: Path) -> None:
+        """Save the subject of the attempt's calibration, whose files are in the folder `result`, and end."""
         folder = self.options.folder
         for name in SUBJECT_FILES:
-            file = self.begin_attempt().path.with_suffix("") / name
-            if file.is_file():
-                shutil.copyfile(file, folder / name)
+            if (result / name).is_file():
+                shutil.copyfile(result / name, folder / name)
         write_segments(folder, self.segments)
         self.accepted, self.is_over = calibration, True
 
@@ -268,42 +267,6 @@ class Guide(Stage):
             every = len(silent) == len(self.segments or self.monitor.sending) > 1
             return f"No samples from {'any sensor' if every else join_names(silent)}. Switched on and in reach?"
         return self.monitor.wrong_unit
-
-
-class Attempt:
-    """The recording of one guided calibration, in its file and in memory: raw samples and the protocol's phases.
-
-    The file gives the same samples and phases again, so that a calibration of it has the same numbers.
-    """
-
-    def __init__(self, path: Path, source: AssignedSource, options: GuideOptions) -> None:
-        setup = replace(options.setup, remounted=True)
-        self._header = setup.header(source.sensors, source.orientations) | {"method": options.method}
-        self.path, self._source, self.log = path, source, LiveLog(path, self._header)
-        self.stream = TickStream(source, self.log)
-        self._markers = Markers()
-
-    def push(self, samples: Sequence[Samples]) -> list[Ticks]:
-        """Record samples of the source; return the ticks that they complete."""
-        ticks = [*self.stream.push(self._source.rename(samples))]
-        self.log.flush_if_due()
-        return ticks
-
-    def mark(self, kind: str, **values: Any) -> None:
-        self._markers.add(kind, values)
-        self.log.event(kind, **values)
-
-    def measured_s(self, phase: str) -> float:
-        """Duration [s] of a phase so far."""
-        return sum(last - first for first, last in self._phases().get(phase, ()))
-
-    def recording(self) -> Recording:
-        """The recording so far, as a reader of the file gets it."""
-        header = self._header | {"phases": self._phases()}
-        return check_recording(build_recording(header, self.stream.clock.rate_hz, self.stream.ticks, None, self.path))
-
-    def _phases(self) -> dict[str, Any]:
-        return self._markers.phases(self.stream.clock.begin, self.stream.newest) if self.stream.ticks else {}
 
 
 class Demonstration:

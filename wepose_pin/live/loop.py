@@ -25,19 +25,19 @@ from ..body.table import check_segments
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
-from ..readers.live_log import LONGEST_TEXT, build_recording
+from ..readers.live_log import LONGEST_TEXT
 from ..recording import ImuSensor, Recording
 from ..recording.arrivals import COUNTS, CUT_OFF, MISSING, Samples, Ticks
 from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker
 from ..tracking.heading_filter import CAUSAL_KNOT_S
-from ..writers.live_log import LiveLog, check_absent
+from ..writers.live_log import check_absent
 from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts
 from .sources.base import Source
 from .sources.replay import ReplaySource
 from .state import QUIT, Action, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
-from .ticks import SensorMonitor, StartPoseSearch, TickStream, check_units
+from .ticks import Recorder, SensorMonitor, StartPoseSearch, check_units
 
 CONNECT_S = 0.2  # [s] for which a source searches before the user is asked again
 SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
@@ -83,9 +83,9 @@ class LiveLoop(Stage):
     ) -> None:
         super().__init__(source, outputs)
         check_mounts(source, setup)
-        self._header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
+        header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
         if setup.subject is not None:  # as a reader of the recording gets it, with the decimals of its text
-            setup = replace(setup, subject=parse_subject(self._header["subject"], Path("subject.toml")))
+            setup = replace(setup, subject=parse_subject(header["subject"], Path("subject.toml")))
         self.setup, self.model = setup, build_subject_model(setup, source.sensors, model)
         check_segments(self.model.table, source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
@@ -96,8 +96,8 @@ class LiveLoop(Stage):
         self._correct_soft_tissue(np.tile([0.0, 0.0, 0.0, 1.0], (len(source.sensors), 1)))  # compiles before poses come
         self._tracker = Tracker(setup.subject, model=self.model, method=method, causal=True)
         self._is_tracking = False  # True from when the start pose is found
-        self.log = LiveLog(None if record is None else Path(record), self._header, force)
-        self._monitor, self._stream = SensorMonitor(source), TickStream(source, self.log)
+        self._stream = Recorder(source, header, None if record is None else Path(record), force)
+        self._monitor, self.log = SensorMonitor(source), self._stream.log
         self._search: StartPoseSearch | None = None  # from when the ticks begin
         # Where stated phases begin (True) and end, in order of time; a phase holds its first second and its last.
         spans = [(name, *span) for name, spans in setup.phases.items() for span in spans]
@@ -202,15 +202,14 @@ class LiveLoop(Stage):
 
     def _start_tracking(self, begin: int, end: int) -> None:
         """Align by the start pose, ticks `begin` to `end`."""
-        rate_hz = self._stream.clock.rate_hz
-        recording = build_recording(self._header, rate_hz, self._stream.ticks, (begin, end), last=end)
+        recording = self._stream.make_recording((begin, end), last=end)
         diagnostics = check_units(recording, self.source)
         self._tracker.push(recording)
         self._monitor.keeps_samples = False
         self._diagnostics = (*self._tracker.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])
         self.log.event("start", begin=begin, end=end)
-        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
+        info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, self._stream.clock.rate_hz)
         for output in self.outputs:
             output.start(info)
         self._is_tracking = True

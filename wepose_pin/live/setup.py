@@ -132,11 +132,7 @@ class AssignedSource(Source):
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         samples = self.source.read(timeout_s)
-        return None if samples is None else self.rename(samples)
-
-    def rename(self, samples: Iterable[Samples]) -> list[Samples]:
-        """The samples of the assigned sensors, named by their segments."""
-        return [each._replace(sensor=self.segments[each.sensor]) for each in samples if each.sensor in self.segments]
+        return None if samples is None else rename_sensors(samples, self.segments)
 
     def describe_awaited(self) -> str:
         return self.source.describe_awaited()
@@ -149,6 +145,11 @@ class AssignedSource(Source):
 
     def close(self) -> None:
         self.source.close()
+
+
+def rename_sensors(samples: Iterable[Samples], segments: Mapping[str, str]) -> list[Samples]:
+    """The samples of the sensors that are assigned to `segments`, named by these."""
+    return [each._replace(sensor=segments[each.sensor]) for each in samples if each.sensor in segments]
 
 
 def read_segments(path: Path, known: Iterable[str]) -> dict[str, str]:

@@ -17,6 +17,7 @@ from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.result import format_longest
 from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
+from ..recording import check_recording
 from ..recording.arrivals import unpack_orientations
 from ..tracking.start_pose import StartPoseDetector
 from .guide import STATURE, Guide, GuideOptions, Step, StepRun
@@ -24,7 +25,7 @@ from .loop import open_and_wait, warm_up
 from .setup import AssignedSource, SensorSetup
 from .sources.base import Source
 from .state import Action, GuideView, Output, join_names
-from .ticks import check_units
+from .ticks import Recorder, check_units
 
 SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
 SHAKE_RATE = 2.5  # [rad/s] rms of a sensor that is shaken; a person who stands is below 0.1
@@ -179,16 +180,17 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
         pose: StartPoseDetector | None = None  # from the first tick on
         while not (asked is AGAIN or reason):
             for ticks in guide.ticks if guide.now >= begin else ():
-                pose = pose or attempt.stream.detect_start_pose(seconds)
+                pose = pose or attempt.detect_start_pose(seconds)
                 row = pose.push(ticks.gyro_S, ticks.accel_S)
-                progress, moving = pose.held_s / seconds, [attempt.stream.sensors[k] for k in pose.moving]
+                progress, moving = pose.held_s / seconds, [attempt.sensors[k] for k in pose.moving]
                 moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
                 moved = moved if pose.state == "moved" else ""
                 if row is not None:
                     last = float(ticks.time[row])
-                    first = last - seconds + 1.0 / attempt.stream.clock.rate_hz
+                    first = last - seconds + 1.0 / attempt.clock.rate_hz
                     try:
-                        check_units(replace(attempt.recording(), phases={"static": ((first, last),)}), guide.source)
+                        static = replace(attempt.make_recording(), phases={"static": ((first, last),)})
+                        check_units(check_recording(static), guide.source)
                     except BadData as error:
                         reason = str(error)
                         break
@@ -207,21 +209,21 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
     """Record a phase of the protocol; the person sees what it has determined. A lost sensor needs the start pose."""
     attempt, phase, target_s = guide.begin_attempt(), motion.phase, motion.seconds
     if asked_for:
-        target_s = max(target_s, attempt.measured_s(phase) + min(MORE_S, target_s))
+        target_s = max(target_s, measure_phase(attempt, phase) + min(MORE_S, target_s))
     begin, running = guide.now + GET_READY_S, False
     estimate: Calibration | None = None  # of the motion so far
     future: Future[Calibration] | None = None  # the next one
     estimated_s = 0.0
     try:
-        while (done_s := attempt.measured_s(phase)) < target_s:
+        while (done_s := measure_phase(attempt, phase)) < target_s:
             if guide.monitor.list_silent(guide.segments, guide.now, MOST_LOSS_S):
                 guide.reason = f"{guide.describe_problems()} Headings were lost: begin once more."
                 return "start"
             if not running and guide.now >= begin:
-                attempt.mark("begin", phase=phase, time=attempt.stream.newest)
+                attempt.mark("begin", phase=phase, time=attempt.newest)
                 running = True
             if future is None and done_s >= max(FIRST_ESTIMATE_S, estimated_s + ESTIMATE_PERIOD_S):
-                estimated_s, future = done_s, calculate(partial(guide.options.calibrate, attempt.recording()))
+                estimated_s, future = done_s, calculate(partial(guide.options.calibrate, attempt.make_recording()))
             elif future is not None and future.done():
                 with suppress(WeposeError):
                     estimate = future.result()
@@ -243,7 +245,12 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
         return ""
     finally:
         if running:
-            attempt.mark("end", phase=phase, time=attempt.stream.newest)
+            attempt.mark("end", phase=phase, time=attempt.newest)
+
+
+def measure_phase(attempt: Recorder, phase: str) -> float:
+    """Duration [s] of a phase so far."""
+    return sum(last - first for first, last in attempt.list_phases().get(phase, ()))
 
 
 def calculate(compute: Callable[[], Calibration]) -> Future[Calibration]:
@@ -286,10 +293,12 @@ def _list_lengths(calibration: Calibration) -> dict[str, tuple[float, float]]:
 
 def show_result(guide: Guide, _: bool) -> StepRun:
     attempt, options = guide.begin_attempt(), guide.options
+    assert attempt.log.path is not None
+    path = attempt.log.path
     attempt.log.flush()
     entered = note = ""  # a length that was entered, and why it cannot be
     while True:
-        future = calculate(partial(options.calibrate, attempt.path, dict(guide.measured)))
+        future = calculate(partial(options.calibrate, path, dict(guide.measured)))
         while not future.done():
             view = GuideView("The motion is being evaluated. You may move freely.", note, actions=(RESTART,))
             if (yield view) is RESTART:
@@ -307,7 +316,7 @@ def show_result(guide: Guide, _: bool) -> StepRun:
         while True:
             asked = yield view._replace(note=note)
             if asked is ACCEPT and calibration is not None:
-                guide.accept(calibration)
+                guide.accept(calibration, path.with_suffix(""))
             elif asked is MORE:
                 motions = [step for step in options.joined.steps if step.phase != "start"]
                 return max(motions, key=lambda step: step.seconds).phase

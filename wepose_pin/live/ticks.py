@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +14,8 @@ from ..body import BodyTable
 from ..body.table import NEUTRAL_POSE
 from ..diagnostics import Diagnostic
 from ..errors import BadData, WrongUnit
-from ..recording import Recording
+from ..readers.live_log import Markers, build_recording
+from ..recording import Intervals, Recording
 from ..recording.arrivals import Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
 from ..recording.plausibility import check_signals, find_unseen_rate
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
@@ -116,14 +119,18 @@ def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
         raise BadData(f"{error.finding}: {error.unit}? {source.explain_unit(error.key, error.unit)}.") from None
 
 
-class TickStream:
-    """Makes ticks once every sensor has sent a sample and the rate is known, and records the arrivals.
+class Recorder:
+    """Records samples in a file, and makes ticks of them once every sensor has sent one and the rate is known.
 
     `clock` makes the ticks; before they have begun it has seen nothing. `ticks` holds them until somebody clears it.
+    The file, which `path`, `header` and `force` decide as of `LiveLog`, gives the same ticks and phases again.
     """
 
-    def __init__(self, source: Source, log: LiveLog) -> None:
-        self.sensors, self.orientations, self.log = tuple(source.sensors), source.orientations, log
+    def __init__(
+        self, source: Source, header: Mapping[str, Any], path: Path | None = None, force: bool = False
+    ) -> None:
+        self.sensors, self.orientations, self.header = tuple(source.sensors), source.orientations, header
+        self.log, self._markers = LiveLog(path, header, force), Markers()
         self.clock = StreamSynchronizer(self.sensors, DEFAULT_RATE_HZ, 0.0, orientations=self.orientations)
         self.has_begun, self.ticks = False, list[Ticks]()
         self._rate_hz, self._begin = source.rate_hz, source.begin
@@ -140,6 +147,7 @@ class TickStream:
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record the samples of one read, and iterate over the ticks that they complete."""
+        self.log.flush_if_due()
         if not samples:
             return
         arrivals = order_arrivals(samples, self.sensors)
@@ -171,11 +179,24 @@ class TickStream:
         self.has_begun = True
         self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self.clock.wait_s)
 
+    def mark(self, kind: str, **values: Any) -> None:
+        """Record an event: the begin or end of a phase, or what is discarded of it."""
+        self._markers.add(kind, values)
+        self.log.event(kind, **values)
+
+    def list_phases(self) -> dict[str, Intervals]:
+        return self._markers.phases(self.clock.begin, self.newest) if self.ticks else {}
+
+    def make_recording(self, start: tuple[int, int] | None = None, last: int | None = None) -> Recording:
+        """Make the recording of the ticks, up to the tick `last`, with the start pose's first and last tick `start`."""
+        header = {**self.header, "phases": {**self.header["phases"], **self.list_phases()}}
+        return build_recording(header, self.clock.rate_hz, self.ticks, start, self.log.path, last=last)
+
 
 class StartPoseSearch:
     """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`."""
 
-    def __init__(self, stream: TickStream, setup: SensorSetup, table: BodyTable) -> None:
+    def __init__(self, stream: Recorder, setup: SensorSetup, table: BodyTable) -> None:
         self._stream, self._pose = stream, stream.detect_start_pose()
         self._stated = next(iter(setup.phases.get("start", ())), None)
         self._instruction = f"Hold still in the start pose, {setup.start_pose}"
