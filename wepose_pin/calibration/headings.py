@@ -29,7 +29,7 @@ from ..filters.sensors import FilteredRecording
 from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, linearize_joint
 from ..recording import Recording
 from .equations import Gaussian, Layout
-from .least_squares import LEAST_CORRELATION_S, Observations
+from .least_squares import LEAST_CORRELATION_S, LeastSquares
 from .protocols import Axis, Closure, Direction, FreeMotion
 
 STARTS, NEARER = 256, 64  # starts of the search, and how many of the best continue after some rounds
@@ -54,25 +54,23 @@ MAX_STD = np.deg2rad(20.0)  # above it the problem is not linear
 # Search ---------------------------------------------------------------------------------------------------------------
 
 
-def search_headings(
-    observations: Observations, x: np.ndarray, stated: Mapping[str, float], couplings: Sequence[Coupling] = ()
-) -> np.ndarray:
+def search_headings(fit: LeastSquares, stated: Mapping[str, float], couplings: Sequence[Coupling] = ()) -> np.ndarray:
     """Return the headings ψ (sensors,) [rad] of the lowest minimum.
 
-    Lengths, points and heights are those of x (m,); `stated` has the ψ of sensors with a stated mount, others may be
+    Lengths are those of its x; `stated` has the ψ of sensors with a stated mount, others may be
     anywhere.
     """
-    sensors = observations.layout.sensors
+    sensors = fit.layout.sensors
     is_known = np.array([name in stated for name in sensors])
     center = np.array([stated.get(name, 0.0) for name in sensors])
-    constant, F = _collect_terms(observations, x, couplings)
+    constant, F = _collect_terms(fit, couplings)
     # A Latin hypercube: each angle of each sensor once, in any order.
     order = np.random.default_rng(0).permuted(np.tile(np.arange(STARTS), (len(sensors), 1)), axis=1).T
     psi, information = np.where(is_known, center, 2.0 * np.pi / STARTS * order), is_known / KNOWN_STD**2
     psi = _descend(psi, constant, F, center, information, FIRST_ROUNDS)[:NEARER]
     headings = wrap_angle(_descend(psi, constant, F, center, information, MORE_ROUNDS)[0])
-    if not stated and all(isinstance(condition, FreeMotion) for condition in observations.layout.conditions):
-        return headings + _turn_by_hinges(observations, headings)
+    if not stated and all(isinstance(condition, FreeMotion) for condition in fit.layout.conditions):
+        return headings + _turn_by_hinges(fit, headings)
     return headings
 
 
@@ -81,14 +79,12 @@ def wrap_angle(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _collect_terms(
-    observations: Observations, x: np.ndarray, couplings: Sequence[Coupling]
-) -> tuple[np.ndarray, np.ndarray]:
+def _collect_terms(fit: LeastSquares, couplings: Sequence[Coupling]) -> tuple[np.ndarray, np.ndarray]:
     """Return c (n, 3) and F (sensors, 5, n, 3) in units of their standard deviations.
 
     They are those of closures at some of their samples, of poses and bows on average, and of couplings.
     """
-    layout, sensors = observations.layout, observations.layout.sensors
+    layout, sensors, lengths = fit.layout, fit.layout.sensors, fit.x[fit.layout.length]
     constants, harmonics = [np.zeros((0, 3))], [np.zeros((len(sensors), 5, 0, 3))]
 
     def add(std: float, constant: np.ndarray, parts: Mapping[str, np.ndarray]) -> None:
@@ -99,24 +95,24 @@ def _collect_terms(
         constants.append(constant / std)
         harmonics.append(F / std)
 
-    count = max(SEARCH_SAMPLES // max(len(observations.closures), 1), LEAST_SEARCH_SAMPLES)
-    for condition, span in observations.spans:
-        some = np.arange(len(observations))[span]
+    count = max(SEARCH_SAMPLES // max(len(fit.closures), 1), LEAST_SEARCH_SAMPLES)
+    for condition, span in fit.spans:
+        some = np.arange(span.start, span.stop)
         if isinstance(condition, Closure):
             some = np.unique(np.linspace(span.start, span.stop - 1, count).astype(int))
-        Q = {name: Rotation.from_quat(observations.data[4 * i : 4 * i + 4, some].T) for i, name in enumerate(sensors)}
+        Q = {name: Rotation.from_quat(fit.data[4 * i : 4 * i + 4, some].T) for i, name in enumerate(sensors)}
         if isinstance(condition, Closure):
             axes = np.array([condition.kind != "plane", condition.kind != "plane", True])
             for path in layout.paths[condition]:
                 constant, parts = np.zeros((len(some), 3)), {}
                 for segment, (B, c) in path.vectors.items():
-                    vector = B @ x[layout.length] + c
+                    vector = B @ lengths + c
                     if segment == UNIVERSE:
                         constant = constant + axes * vector
                     else:
                         parts[segment] = axes * _expand(Q[segment], vector)
                 if condition.kind == "recorded":
-                    constant = constant - observations.data[layout.place][:, some].T
+                    constant = constant - fit.data[layout.place][:, some].T
                 elif condition.at is not None:
                     constant = constant - condition.at
                 elif condition.kind in ("fixed_point", "plane"):  # of any mean
@@ -195,13 +191,13 @@ def _descend(
     return psi[np.argsort(cost, kind="stable")]
 
 
-def _turn_by_hinges(observations: Observations, headings: np.ndarray) -> float:
+def _turn_by_hinges(fit: LeastSquares, headings: np.ndarray) -> float:
     """Return the rotation [rad] of all headings by which segments lie on the side to which their hinges bend."""
-    sensors, bent = observations.layout.sensors, 0.0j
+    sensors, bent = fit.layout.sensors, 0.0j
     turns = [Rotation.from_rotvec([0.0, 0.0, heading]) for heading in headings]
-    for hinge in observations.layout.hinges:
+    for hinge in fit.layout.hinges:
         pair = sensors.index(hinge.on), sensors.index(hinge.moves)
-        Q = (Rotation.from_quat(observations.data[4 * i : 4 * i + 4].T) for i in pair)
+        Q = (Rotation.from_quat(fit.data[4 * i : 4 * i + 4].T) for i in pair)
         on, moves = (turns[i] * each * turns[i].inv() for i, each in zip(pair, Q, strict=True))
         along = (on.inv() * moves).apply(hinge.along)
         bent += np.sum(along[:, 0] + 1j * along[:, 1]) * complex(hinge.side[0], -hinge.side[1])

@@ -54,16 +54,19 @@ LEAST_LENGTH_STD = 0.010
 Block = tuple[slice, slice, np.ndarray, float]
 
 
-@dataclass(frozen=True)
-class Observations:
-    """n samples, each of one condition."""
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c) of n samples, each of one condition, at one x; to be made least."""
 
     layout: Layout
     data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.place`, [s] since the start pose
     condition_index: np.ndarray  # (n,) number of each sample's condition, in ascending order
-
-    def __len__(self) -> int:
-        return self.data.shape[1]
+    prior: Gaussian  # c and Λ
+    x: np.ndarray  # (m,)
+    weights: np.ndarray  # w (n, k) of the samples' residuals r
+    contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
+    effective_sample_size: float = 0.0  # of the gap
+    posed: Mapping[str, float] = field(default_factory=dict)  # phase of poses → standard deviations off all else
 
     @cached_property
     def spans(self) -> list[tuple[Condition, slice]]:
@@ -71,12 +74,12 @@ class Observations:
         edges = np.searchsorted(self.condition_index, np.arange(len(self.layout.conditions) + 1))
         return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.layout.conditions)]
 
-    @cached_property
+    @property
     def closures(self) -> list[tuple[Closure, slice]]:
         """Each closure with the slice of its samples."""
         return [(condition, span) for condition, span in self.spans if isinstance(condition, Closure)]
 
-    @cached_property
+    @property
     def poses(self) -> dict[str, list[tuple[Direction | Axis, slice]]]:
         """Phase → its stated poses, each with the slice of its samples."""
         poses: dict[str, list[tuple[Direction | Axis, slice]]] = {}
@@ -85,33 +88,28 @@ class Observations:
                 poses.setdefault(condition.phase, []).append((condition, span))
         return poses
 
-    @property
-    def min_correlation(self) -> float:
-        """The number of samples in `LEAST_CORRELATION_S`."""
-        return LEAST_CORRELATION_S / max(float(np.median(np.diff(self.data[-1]))), 1e-3)
-
     @cached_property
     def _functions(self) -> list[tuple[tuple[ca.Function, ca.Function], ca.DM]]:
         """The functions of each condition with its data, which CasADi maps them over."""
         return [(self.layout.functions[condition], ca.DM(self.data[:, span])) for condition, span in self.spans]
 
-    def residuals(self, x: ca.MX | np.ndarray) -> tuple[ca.MX, ca.MX]:
+    def express_residuals(self, x: ca.MX | np.ndarray) -> tuple[ca.MX, ca.MX]:
         """Return the residuals (k, n) and the gaps (3, n) [m], zero without a closure, in CasADi."""
         r, gaps = zip(*(functions[0](x, data) for functions, data in self._functions), strict=True)
         return ca.horzcat(*r), ca.horzcat(*gaps)
 
-    def jacobian(self, x: ca.MX | np.ndarray) -> ca.MX:
+    def express_jacobian(self, x: ca.MX | np.ndarray) -> ca.MX:
         """Return the transposed Jacobian of all residuals (m, n k), sample by sample, in CasADi."""
         return ca.horzcat(*(functions[1](x, data) for functions, data in self._functions))
 
-    def gaps(self, x: np.ndarray) -> np.ndarray:
+    def measure_gaps(self, x: np.ndarray) -> np.ndarray:
         """Return the gaps (n, 3) [m] at x (m,), zero without a closure."""
-        return np.asarray(self.residuals(x)[1]).T
+        return np.asarray(self.express_residuals(x)[1]).T
 
     def place_points(self, x: np.ndarray) -> np.ndarray:
         """Return x with each unknown fixed point and height at the mean of the body's points that lie on it."""
         unknown = self.layout.unknown
-        x, gaps = x.copy(), self.gaps(x) if unknown else np.zeros((len(self), 3))
+        x, gaps = x.copy(), self.measure_gaps(x) if unknown else np.zeros((0, 3))
         for closure, span in self.closures:
             if closure.kind == "plane":
                 x[unknown[closure]] += gaps[span, : closure.rows].mean()
@@ -119,35 +117,22 @@ class Observations:
                 x[unknown[closure]] += gaps[span].mean(axis=0)
         return x
 
-
-@dataclass(frozen=True, eq=False)
-class LeastSquares:
-    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c) at one x, to be made least; and how the weights were found (`weights`)."""
-
-    observations: Observations  # n samples, each with k residuals r
-    prior: Gaussian  # c and Λ
-    weights: np.ndarray  # w (n, k)
-    x: np.ndarray  # (m,)
-    contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
-    effective_sample_size: float = 0.0  # of the gap
-    posed: Mapping[str, float] = field(default_factory=dict)  # phase of poses → standard deviations off all else
-
     @property
     def lower_bounds(self) -> np.ndarray:
         """(m,) of x: no length is below `MIN_LENGTH`, all else is free."""
         bounds = np.full(len(self.x), -np.inf)
-        bounds[self.observations.layout.length] = MIN_LENGTH
+        bounds[self.layout.length] = MIN_LENGTH
         return bounds
 
     @cached_property
     def residuals(self) -> np.ndarray:
         """(n, k) of the samples; the first three are those of a closure, whitened, or of another condition."""
-        return np.asarray(self.observations.residuals(self.x)[0]).T
+        return np.asarray(self.express_residuals(self.x)[0]).T
 
     @cached_property
     def jacobian(self) -> np.ndarray:
         """(n, k, m) of the residuals."""
-        return np.asarray(self.observations.jacobian(self.x)).T.reshape(*self.residuals.shape, -1)
+        return np.asarray(self.express_jacobian(self.x)).T.reshape(*self.residuals.shape, -1)
 
     @cached_property
     def information(self) -> np.ndarray:
@@ -176,15 +161,15 @@ def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> 
     It takes `steps` at most. Where they do not suffice, or a length is at its bound, it raises `NoSolution` if
     `strict`, else it returns the last x.
     """
-    observations, (mean, information), weights = problem.observations, problem.prior, problem.weights
+    (mean, information), weights = problem.prior, problem.weights
     start = np.maximum(problem.x, problem.lower_bounds)
     # In units of the prior's standard deviations the gradient says how far there is to go.
     scale = np.diag(information) ** -0.5
     z = ca.MX.sym("z", len(start))
     x = start + scale * z
-    squares = ca.dot(ca.DM(weights.T), observations.residuals(x)[0] ** 2)
+    squares = ca.dot(ca.DM(weights.T), problem.express_residuals(x)[0] ** 2)
     cost = 0.5 * squares + 0.5 * ca.bilin(information, x - mean, x - mean)
-    JT = scale * observations.jacobian(x)
+    JT = scale * problem.express_jacobian(x)
     hessian = ca.mtimes(JT @ ca.diag(ca.DM(weights.ravel())), JT.T, _BLAS)
     hessian += np.outer(scale, scale) * information
     inputs = {"x": z, "p": ca.MX.sym("none", 0, 1), "lam:f": ca.MX.sym("lam", 1), "lam:g": ca.MX.sym("none", 0, 1)}
@@ -209,7 +194,7 @@ def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> 
     solution = replace(problem, x=np.maximum(start + scale * minimiser, problem.lower_bounds))
     if not strict:
         return solution
-    lengths, names = solution.x[observations.layout.length], observations.layout.lengths
+    lengths, names = solution.x[problem.layout.length], problem.layout.lengths
     failure = "" if solution.remaining < LOOSE_TOLERANCE else f"{solution.remaining:.2g} standard deviations to go"
     if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         failure = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
@@ -224,24 +209,21 @@ def solve(problem: LeastSquares, steps: int = STEPS, *, strict: bool = True) -> 
 # Weights --------------------------------------------------------------------------------------------------------------
 
 
-def solve_reweighted(
-    observations: Observations, prior: Gaussian, start: np.ndarray, contact: np.ndarray, quick: bool = False
-) -> LeastSquares:
+def solve_reweighted(start: LeastSquares, quick: bool = False) -> LeastSquares:
     """Return the fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
 
     Poses beside a closure are used where they do not contradict it. What they are compared with is found without them.
-    It begins with x `start` (m,), in which `contact` (n,) is the weight of each sample's gap. `quick`: one round with
-    few steps and without hinges.
+    `quick`: one round with few steps and without hinges.
     """
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
-    closures, poses = observations.closures, observations.poses
-    stated, posed = _state_weights(observations, contact), dict[str, float]()
+    closures, poses = start.closures, start.poses
+    stated, posed = _state_weights(start), dict[str, float]()
     if quick:
         stated[:, GAP_ROWS:] = 0.0
     weights = stated.copy()
     for span in [span for own in poses.values() for _, span in own] if closures else ():
         weights[span] = 0.0
-    fit = LeastSquares(observations, prior, weights, start, contact)
+    fit = replace(start, weights=weights)
     for k in range(rounds if closures else 0):
         fit = solve(fit, steps if k == 0 else ROUND_STEPS, strict=False)
         weights, contact = fit.weights.copy(), fit.contact.copy()
@@ -253,7 +235,7 @@ def solve_reweighted(
             usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[rows], LEAST_VARIANCE)
             weight = (1.0 + size / (usual * OUTLIER**2 * rows)) ** -2
             contact[span] = np.where(weight > least, weight, 0.0)
-        for block in _list_blocks(observations, contact, hinges=not quick):
+        for block in _list_blocks(fit, contact, hinges=not quick):
             span, columns, touch, _ = block
             variance, correlated = _measure_block(fit, block)
             weights[span, columns] = touch[:, None] / (correlated * variance)
@@ -265,16 +247,16 @@ def solve_reweighted(
     fit = solve(fit, steps if quick else FINAL_STEPS, strict=not quick)
     if not closures and not quick:
         posed = {phase: _measure_pose(fit, own, stated, used=True) for phase, own in poses.items()}
-    blocks = _list_blocks(observations, contact, hinges=False)
+    blocks = _list_blocks(fit, fit.contact, hinges=False)
     size = sum((float(block[2].sum()) / _measure_block(fit, block)[1] for block in blocks), 0.0)
     return replace(fit, effective_sample_size=size, posed=posed)
 
 
-def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool = True) -> list[Block]:
+def _list_blocks(fit: LeastSquares, contact: np.ndarray, hinges: bool = True) -> list[Block]:
     blocks: list[Block] = []
-    for closure, span in observations.closures:
+    for closure, span in fit.closures:
         blocks.append((span, slice(closure.rows), contact[span], LEAST_VARIANCE))
-        if observations.layout.hinges and hinges:
+        if fit.layout.hinges and hinges:
             # However well an elbow's axis fits this motion: what it leaves a hinge by follows the pose.
             every = np.ones(span.stop - span.start)
             blocks.append((span, slice(GAP_ROWS, None), every, (ELBOW_STD / HINGE_STD) ** 2))
@@ -287,24 +269,29 @@ def _measure_block(fit: LeastSquares, block: Block) -> tuple[float, float]:
     r = fit.residuals[span, columns]
     variance = float(contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(contact.sum()))
     return max(variance, least_variance), count_correlated_samples(
-        r * contact[:, None], fit.observations.min_correlation
+        r * contact[:, None], find_min_correlation(fit.data[-1])
     )
 
 
-def _state_weights(observations: Observations, contact: np.ndarray) -> np.ndarray:
+def _state_weights(fit: LeastSquares) -> np.ndarray:
     """Return the weights (n, k) of poses, which are stated, and those of closures to begin with."""
-    weights = np.full((len(observations), observations.layout.residuals), 1.0 / observations.min_correlation)
-    weights[:, :GAP_ROWS] *= contact[:, None]
-    for condition, span in observations.spans:
+    weights = np.full((len(fit.contact), fit.layout.residuals), 1.0 / find_min_correlation(fit.data[-1]))
+    weights[:, :GAP_ROWS] *= fit.contact[:, None]
+    for condition, span in fit.spans:
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
         size = ELBOW_STD / HINGE_STD if isinstance(condition, FreeMotion) else 1.0
         if isinstance(condition, Axis):  # by the sine of its bend an axis leaves the horizontal if it is off
-            first = 4 * observations.layout.sensors.index(condition.segment)
-            x, y, _, _ = observations.data[first : first + 4, span]
+            first = 4 * fit.layout.sensors.index(condition.segment)
+            x, y, _, _ = fit.data[first : first + 4, span]
             size = max(float(np.sqrt(np.mean(1.0 - (1.0 - 2.0 * (x**2 + y**2)) ** 2))), LEAST_BEND)
         if not isinstance(condition, Closure):
             weights[span] = size**-2 / (span.stop - span.start)
     return weights
+
+
+def find_min_correlation(time: np.ndarray) -> float:
+    """Return how many samples at times (n,) [s] lie in `LEAST_CORRELATION_S`."""
+    return LEAST_CORRELATION_S / max(float(np.median(np.diff(time))), 1e-3)
 
 
 def count_correlated_samples(r: np.ndarray, least: float) -> float:
@@ -326,12 +313,12 @@ def estimate_covariance(fit: LeastSquares) -> np.ndarray:
     sample and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
-    observations, weights, J, C = fit.observations, fit.weights, fit.jacobian, fit.covariance
+    weights, J, C = fit.weights, fit.jacobian, fit.covariance
     gradient = fit.prior[1].copy()
-    for condition, span in observations.spans:
+    for condition, span in fit.spans:
         if not isinstance(condition, Closure):
             gradient += np.einsum("nk,nki,nkj->ij", weights[span], J[span], J[span], optimize=True)
-    for block in _list_blocks(observations, fit.contact):
+    for block in _list_blocks(fit, fit.contact):
         span, columns, contact, _ = block
         slope, (variance, duration) = J[span, columns], _measure_block(fit, block)
         # The fit has reduced the residuals: their variance gets back what it took.
@@ -362,7 +349,7 @@ class MeasuredLength(NamedTuple):
 
 def compare_measured(fit: LeastSquares, measured: Mapping[str, tuple[float, float]]) -> dict[str, MeasuredLength]:
     """Return each measured length, name → ([m], its standard deviation [m]), beside the solution without it."""
-    layout, compared = fit.observations.layout, {}
+    layout, compared = fit.layout, {}
     least_std = 0.0 if layout.model.table.is_mechanism else LEAST_LENGTH_STD
     for name, (metres, std) in measured.items():
         row = layout.lengths.index(name)

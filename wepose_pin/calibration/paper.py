@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 from ..body.girdle import FIXED
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
-from ..errors import BadOption, NoSolution, one_of
-from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples
+from ..errors import BadOption, BadSubject, NoSolution, one_of
+from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples, find_min_correlation
 from .problem import CalibrationProblem
 from .protocols import Closure
 from .result import Calibration
@@ -46,23 +46,25 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         Another start pose, other conditions, or a scale that was not measured.
     BadSession
         A mount that is not known, or that gravity contradicts.
+    BadSubject
+        The prior has no positive definite covariance of its lengths.
     NoSolution
         The gap does not determine the lengths.
     """
     _check_problem(problem)
     recording, filtered, prior = problem.recording, problem.filtered, problem.prior
     mounts, headings, mount_diagnostics = align_sensors(recording, prior, filtered.R_VS_start, filtered.start)
-    observations, samples = problem.observe()
+    data, condition_index, samples = problem.observe()
     quat_WL = {
         name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
         for name, R_VS in filtered.R_VS.items()
     }
     names = problem.layout.lengths
     A = np.zeros((len(samples), 3, len(names)))
-    for closure, span in observations.closures:
-        [path] = problem.layout.paths[closure]
+    for k, closure in enumerate(problem.protocol.closures):
+        own, [path] = condition_index == k, problem.layout.paths[closure]
         for segment, (B, _) in path.vectors.items():
-            A[span] += Rotation.from_quat(quat_WL[segment][span]).as_matrix() @ B
+            A[own] += Rotation.from_quat(quat_WL[segment][own]).as_matrix() @ B
     rows, advice = (
         A.reshape(-1, len(names)),
         "check that the hands do in the phase what the protocol says, and every mount",
@@ -80,7 +82,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         shortest = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
         raise NoSolution(f"{recording.where()}: the gap is least with {shortest}; {advice}")
     gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in names]
-    correlated = count_correlated_samples(gaps, observations.min_correlation)  # samples that make one independent one
+    correlated = count_correlated_samples(gaps, find_min_correlation(data[-1]))  # samples that make one independent one
     variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
     covariance = correlated * variance * by_gap + by_d @ d_cov @ by_d.T
     others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
@@ -124,12 +126,14 @@ def _check_problem(problem: CalibrationProblem) -> None:
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "
             f"such as clasp; not '{protocol.name}'"
         )
-    groups = problem.layout.length_groups.values()
+    names, prior, groups = problem.layout.lengths, problem.prior, problem.layout.length_groups.values()
+    if np.any(np.linalg.eigvalsh(prior.lengths_covariance(names)) <= 0.0):
+        raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
     if not any(set(group) <= set(problem.measured) for group in groups):
-        names = [group[0] for group in groups if len(group) == 1]
+        single = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
             f"formulation 'paper' needs one measured length that fixes the scale, as in --measured "
-            f"{protocol.measured_example}; {one_of(names)}"
+            f"{protocol.measured_example}; {one_of(single)}"
         )
 
 

@@ -30,7 +30,6 @@ from ..recording import Recording, format_span
 from ..recording.gaps import find_runs
 from .equations import Gaussian, Layout
 from .headings import Coupling, estimate_couplings
-from .least_squares import Observations
 from .protocols import Closure, Condition, FreeMotion, Protocol
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
@@ -229,8 +228,8 @@ class CalibrationProblem:
                 diagnostics.append(Diagnostic("samples-not-connected", WARNING, lost, unused, facts=facts))
         return diagnostics
 
-    def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[Observations, np.ndarray]:
-        """Return the observations of all conditions, and the numbers (n,) of their samples in the recording.
+    def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return data and condition of n samples, as in `LeastSquares`, and their numbers (n,) in the recording.
 
         It raises `BadPhase` where a condition has too few samples with all sensors, connected with the start pose.
         """
@@ -264,7 +263,7 @@ class CalibrationProblem:
         recorded = np.concatenate(places).T[: layout.place.stop - layout.place.start]
         data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        return Observations(layout, data, condition_index), samples
+        return data, condition_index, samples
 
 
 def _name_phase(condition: Condition) -> str:

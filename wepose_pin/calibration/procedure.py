@@ -239,26 +239,28 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
     `quick`: at fewer samples and by the closure alone, which shows whether mounts and labels can be as stated, and
     raises nothing.
     """
-    observations, samples = problem.observe(QUICK_RATE_HZ if quick else SAMPLE_RATE_HZ)
+    data, condition_index, samples = problem.observe(QUICK_RATE_HZ if quick else SAMPLE_RATE_HZ)
     layout, sensors = problem.layout, {name: problem.sensor_prior(name) for name in problem.layout.sensors}
     mean, information = build_prior(layout, problem.prior, problem.measured, sensors)
+    weights, contact = np.ones((len(samples), layout.residuals)), np.ones(len(samples))
+    fit = LeastSquares(layout, data, condition_index, (mean, information), mean.copy(), weights, contact)
     couplings = [] if quick and problem.protocol.closures else problem.couplings
-    headings = search_headings(observations, mean, problem.stated_headings, couplings)
+    headings = search_headings(fit, problem.stated_headings, couplings)
     is_free = [name not in problem.stated_headings for name in layout.sensors]
     mean[layout.heading[is_free]] = headings[is_free]
     prior = add_couplings((mean, information), layout, couplings)
-    start = observations.place_points(prior[0])
+    start = fit.place_points(prior[0])
     # The weight of a gap in the initial guess: near 0 where the palms are apart.
-    contact = (1.0 + np.sum(observations.gaps(start) ** 2, axis=1) / WIDE**2) ** -2
-    fit = solve_reweighted(observations, prior, start, contact, quick)
+    contact = (1.0 + np.sum(fit.measure_gaps(start) ** 2, axis=1) / WIDE**2) ** -2
+    fit = solve_reweighted(replace(fit, prior=prior, x=start, contact=contact), quick)
     return _describe(problem, samples, fit, fit.covariance if quick else estimate_covariance(fit))
 
 
 def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquares, x_cov: np.ndarray) -> Calibration:
     """Return the calibration that a solution at samples (n,) makes, with the covariance (m, m) of x."""
-    observations, layout, prior, filtered = fit.observations, problem.layout, problem.prior, problem.filtered
-    closed = np.zeros(len(observations), dtype=bool)
-    for _, span in observations.closures:
+    layout, prior, filtered = problem.layout, problem.prior, problem.filtered
+    closed = np.zeros(len(samples), dtype=bool)
+    for _, span in fit.closures:
         closed[span] = True
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
@@ -275,7 +277,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
     prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
     gap, prior_gap = (
         np.where(closed, np.linalg.norm(gaps, axis=1), np.nan)
-        for gaps in (observations.gaps(fit.x), observations.gaps(observations.place_points(prior_x)))
+        for gaps in (fit.measure_gaps(fit.x), fit.measure_gaps(fit.place_points(prior_x)))
     )
     diagnostics = [*filtered.diagnostics, *problem.diagnose_losses()]
     if not problem.protocol.closures:
@@ -284,7 +286,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
     for name in [name for name in filtered.R_VS if name not in subject.mounts]:
         diagnostics.append(Diagnostic("mount-unknown", WARNING, name, facts={"protocol": problem.protocol.name}))
     for phase, deviation in fit.posed.items():
-        if deviation > CONTRADICTED and observations.closures:
+        if deviation > CONTRADICTED and fit.closures:
             diagnostics.append(Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED))
     return Calibration(
         problem=problem,
@@ -305,7 +307,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
 
 def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray, scatter: float) -> Subject:
     """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`estimate_scatter`)."""
-    R_VS_start, layout, x = problem.filtered.R_VS_start, fit.observations.layout, fit.x
+    R_VS_start, layout, x = problem.filtered.R_VS_start, fit.layout, fit.x
     std, R_WS_start, offsets, drifts = np.sqrt(np.diag(x_cov)), {}, {}, {}
     for name, heading, tilt, drift in zip(layout.sensors, layout.heading, layout.tilt, layout.drift, strict=True):
         R_WV = Rotation.from_rotvec([0.0, 0.0, x[heading]])
@@ -335,8 +337,8 @@ def _estimate_hinges(
     problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray
 ) -> tuple[dict[str, Hinge], dict[str, float]]:
     """Return joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
-    layout, hinges, hinge_rms = fit.observations.layout, {}, {}
-    spans = [span for c, span in fit.observations.spans if isinstance(c, Closure | FreeMotion)]
+    layout, hinges, hinge_rms = fit.layout, {}, {}
+    spans = [span for c, span in fit.spans if isinstance(c, Closure | FreeMotion)]
     lags = {
         hinge.on: float(fit.x[row])
         for hinge, row in zip(layout.twists, layout.twist, strict=True)
