@@ -15,7 +15,6 @@ each side is B a.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -29,16 +28,6 @@ LEAST_RATE_HZ = 20.0  # of recordings that are used
 # Where a sensor sits is known from its segment alone: in the middle, give or take this much on each axis; assumption.
 LEVER_STD = 0.08  # [m]
 LEVER_STD_OF_LENGTH = 0.3  # of the distance to the joint, on large bodies
-
-
-class JointPair(NamedTuple):
-    """Two sensors at one joint, on the segment nearer the root and on the far one."""
-
-    near: str
-    far: str
-    levers: np.ndarray  # (6,) [m] usual ones from the joint to the near sensor and to the far one, each in its own S
-    lever_std: float  # [m] of each
-    travels: bool  # whether the joint travels on the near segment, as a shoulder does
 
 
 def linearize_joint(
@@ -91,21 +80,31 @@ def find_neighbours(model: BodyModel, sensors: Collection[str]) -> list[tuple[st
     return pairs
 
 
-def find_joint_pairs(model: BodyModel, quat_LS: Mapping[str, np.ndarray]) -> tuple[JointPair, ...]:
-    """Find the joints between two sensors, by the mounts (4,) xyzw of all sensors."""
-    data = model.pin.createData()
+def find_joint_pairs(
+    model: BodyModel, quat_LS: Mapping[str, np.ndarray]
+) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray, np.ndarray]:
+    """Find the joints between two sensors, by the mounts (4,) xyzw of all sensors.
+
+    Returns
+    -------
+    pairs : p pairs of segments with the sensors, the one nearer the root first
+    levers : (p, 6) [m] usual ones from the joint to the near sensor and to the far one, each in its own S
+    lever_std : (p,) [m] of each
+    travels : (p,) bool: the joint travels on the near segment, as a shoulder does
+    """
+    data, pairs = model.pin.createData(), find_neighbours(model, quat_LS)
     pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
     placement = {name: data.oMf[model.pin.getFrameId(name)] for name in (*model.parents, *model.point_frames.values())}
     spine = {name for name, segment in model.table.segments.items() if segment.spine}
-    pairs = []
-    for near, far in find_neighbours(model, quat_LS):
+    levers, std = np.empty((len(pairs), 6)), np.empty(len(pairs))
+    for i, (near, far) in enumerate(pairs):
         joint_W = placement[near if far in spine else far].translation
         levers_W = [_locate_sensor(model, name, placement, spine) - joint_W for name in (near, far)]
         R_WS = [placement[name].rotation @ Rotation.from_quat(quat_LS[name]).as_matrix() for name in (near, far)]
-        std = max(LEVER_STD, LEVER_STD_OF_LENGTH * max(float(np.linalg.norm(lever)) for lever in levers_W))
-        levers = np.concatenate([R.T @ lever for R, lever in zip(R_WS, levers_W, strict=True)])
-        pairs.append(JointPair(near, far, levers, std, near in spine and not model.table.is_mechanism))
-    return tuple(pairs)
+        std[i] = max(LEVER_STD, LEVER_STD_OF_LENGTH * max(float(np.linalg.norm(lever)) for lever in levers_W))
+        levers[i] = np.concatenate([R.T @ lever for R, lever in zip(R_WS, levers_W, strict=True)])
+    travels = np.array([near in spine and not model.table.is_mechanism for near, _ in pairs], dtype=bool)
+    return pairs, levers, std, travels
 
 
 def _locate_sensor(

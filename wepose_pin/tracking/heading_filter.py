@@ -133,7 +133,7 @@ class HeadingFilter:
         self._rate_var, hinge_std = RATE_STD[kind] ** 2, float(HINGE_STD[kind])
         raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
         self.measured = np.array([name not in raw for name in self.names])
-        self.pairs = find_joint_pairs(model, raw) if first.rate_hz >= LEAST_RATE_HZ else ()
+        self.pairs, levers, lever_std, travels = find_joint_pairs(model, raw if first.rate_hz >= LEAST_RATE_HZ else {})
         self.hinges, axis_std, tilt_std, self._hinge_std = _find_hinges(first, self.names, subject, model, hinge_std)
         [closure] = load_protocol(CLASP).closures
         self.palms, (left, right) = None, closure.points
@@ -166,8 +166,7 @@ class HeadingFilter:
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
         h, always, known = len(self.hinges), np.inf, np.sqrt(start[3])
         rate_std = np.hypot(RATE_STD[kind], np.where(np.isfinite(known), known, rate_std))
-        joint_std = np.array([GIRDLE_STD[kind] if pair.travels else JOINT_STD for pair in self.pairs])
-        lever_std = np.array([[pair.lever_std] * 6 for pair in self.pairs]).reshape(-1, 6)
+        joint_std = np.where(travels, GIRDLE_STD[kind], JOINT_STD)
         twist_std, force_std = np.full(h, TWIST_STD[kind]), np.full((k, 3), FORCE_STD)
         delay_std = np.full(k, AVERAGED_SAMPLES / first.rate_hz + CHIP_DELAY_STD)
         states = {
@@ -181,7 +180,7 @@ class HeadingFilter:
             "force": (force_std, FORCE_CORRELATION_S),  # [m/s²] fixed in the sensor's frame
             "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
             "start": (np.zeros(k), always),  # [rad] of the segment's heading in the start pose
-            "lever": (lever_std, always),  # [m] of the near and the far sensor from the joint
+            "lever": (np.tile(lever_std[:, None], 6), always),  # [m] of the near and the far sensor from the joint
         }
         ends = np.cumsum([std.size for std, _ in states.values()])
         places = np.split(np.arange(ends[-1]), ends[:-1])
@@ -195,9 +194,9 @@ class HeadingFilter:
         self.x, self.P = np.zeros(len(std)), np.diag(std**2)
         index = self.names.index
         self._pair_columns = []  # (17,) each: headings of its segments, joint; lever, force and delay near and far
+        self.x[c["lever"]] = levers
         for i, pair in enumerate(self.pairs):
-            self.x[c["lever"][i]] = pair.levers
-            near, far, lever = index(pair.near), index(pair.far), c["lever"][i]
+            near, far, lever = index(pair[0]), index(pair[1]), c["lever"][i]
             sides = [(*own, *c["force"][at], c["delay"][at]) for own, at in ((lever[:3], near), (lever[3:], far))]
             self._pair_columns.append(np.array([near, far, c["joint"][i], *sides[0], *sides[1]]))
         self._hinge_columns = [  # (5,) each: headings of the segments below and above, axis, twist, tilt

@@ -45,7 +45,7 @@ class HeadingCorrection:
     def summarize(self) -> dict[str, Any]:
         """What was observed and the largest correction of each heading, as ``summary.json`` has it."""
         return {
-            "joint_accelerations": [pair.far for pair in self.filter.pairs],
+            "joint_accelerations": [far for _, far in self.filter.pairs],
             "hinges": [hinge.name for hinge in self.filter.hinges],
             "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
         }
