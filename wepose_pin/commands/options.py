@@ -43,10 +43,11 @@ def described_by(*functions: str) -> Callable[[Command], Command]:
             tree = ast.parse((_PACKAGE / file).read_text(encoding="utf-8"))
             function = next(node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name)
             shared = read_descriptions(ast.get_docstring(function)) | shared
-        own = read_descriptions(command.__doc__)
-        texts = {name: f"{shared.get(name, '')} {own.get(name, '')}" for name in inspect.signature(command).parameters}
-        head = inspect.cleandoc(command.__doc__ or "").partition(_PARAMETERS)[0]
-        command.__doc__ = head + _PARAMETERS + "".join(f"{name}\n    {text.strip()}\n" for name, text in texts.items())
+        own, entries = read_descriptions(command.__doc__), ""
+        for name, parameter in inspect.signature(command).parameters.items():
+            texts = shared.get(name) if parameter.kind is parameter.KEYWORD_ONLY else None, own.get(name)
+            entries += f"{name}\n    {' '.join(filter(None, texts))}\n"
+        command.__doc__ = inspect.cleandoc(command.__doc__ or "").partition(_PARAMETERS)[0] + _PARAMETERS + entries
         return command
 
     return complete
