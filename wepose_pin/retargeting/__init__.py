@@ -4,36 +4,25 @@ Frames: B is the robot's root, the frame of its URDF; T is the person's torso, x
 coordinates in T to B. `u` holds the values of the joints of the arms, `q` is Pinocchio's configuration.
 """
 
-from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisions
-from .controller import ControllerParams
-from .files import build_table, summarize, write_trajectory
-from .maps import ROBOTS, RobotMap, find_map, read_joint_limits, read_map
-from .robot import Robot, load_robot
-from .stream import ArmObserver, Command, CommandStream
-from .targets import ArmTargets, compute_arm_targets
-from .trajectory import Trajectory, retarget
-
-__all__ = [
-    "ROBOTS",
-    "ArmObserver",
-    "ArmTargets",
-    "Command",
-    "CommandStream",
-    "ControllerParams",
-    "LimitCheck",
-    "Robot",
-    "RobotMap",
-    "SelfCollisions",
-    "Trajectory",
-    "build_table",
-    "check_limits",
-    "compute_arm_targets",
-    "find_map",
-    "find_self_collisions",
-    "load_robot",
-    "read_joint_limits",
-    "read_map",
-    "retarget",
-    "summarize",
-    "write_trajectory",
-]
+from .checks import LimitCheck as LimitCheck
+from .checks import SelfCollisions as SelfCollisions
+from .checks import check_limits as check_limits
+from .checks import find_self_collisions as find_self_collisions
+from .controller import ControllerParams as ControllerParams
+from .files import build_table as build_table
+from .files import summarize as summarize
+from .files import write_trajectory as write_trajectory
+from .maps import ROBOTS as ROBOTS
+from .maps import RobotMap as RobotMap
+from .maps import find_map as find_map
+from .maps import read_joint_limits as read_joint_limits
+from .maps import read_map as read_map
+from .robot import Robot as Robot
+from .robot import load_robot as load_robot
+from .stream import ArmObserver as ArmObserver
+from .stream import Command as Command
+from .stream import CommandStream as CommandStream
+from .targets import ArmTargets as ArmTargets
+from .targets import compute_arm_targets as compute_arm_targets
+from .trajectory import Trajectory as Trajectory
+from .trajectory import retarget as retarget
