@@ -101,7 +101,7 @@ class Session:
 
 def keeps_its_limits(messages: Sequence[dict[str, Any]], robot: retargeting.Robot) -> None:
     """What was sent, by differences of its positions against the URDF's own text and the map's numbers."""
-    said = retargeting.read_joint_limits(robot.map.urdf)
+    said = robot.map.read_joint_limits()
     joints = robot.names
     q, v, a = (np.array([message[key] for message in messages]) for key in ("position", "velocity", "acceleration"))
     clock = np.array([message["clock"] for message in messages])

@@ -15,7 +15,6 @@ from .files import write_trajectory as write_trajectory
 from .maps import ROBOTS as ROBOTS
 from .maps import RobotMap as RobotMap
 from .maps import find_map as find_map
-from .maps import read_joint_limits as read_joint_limits
 from .maps import read_map as read_map
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot

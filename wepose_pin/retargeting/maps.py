@@ -31,28 +31,6 @@ class JointLimit(NamedTuple):
     mimic: tuple[str, float, float] | None  # joint, multiplier, offset: value = multiplier * its value + offset
 
 
-def read_joint_limits(path: Path) -> dict[str, JointLimit]:
-    """Read the limits of every movable joint of a URDF, without Pinocchio; zero where it has none.
-
-    So a check against them shares no code with the controller.
-
-    Raises
-    ------
-    MissingFile, BadModel
-        Not there; not a URDF.
-    """
-    limits = {}
-    for joint in read_urdf(path).joints:
-        if joint.type in ("revolute", "continuous", "prismatic"):
-            limit, mimic = joint.limit, joint.mimic
-            lower, upper, velocity = (getattr(limit, key, 0.0) or 0.0 for key in ("lower", "upper", "velocity"))
-            if joint.type == "continuous":
-                lower, upper = -np.inf, np.inf
-            source = None if mimic is None else (mimic.joint, mimic.multiplier, mimic.offset)
-            limits[joint.name] = JointLimit(joint.type, lower, upper, velocity, source)
-    return limits
-
-
 class LinkPoint(NamedTuple):
     """A point of the robot, at `offset` [m] in the frame of a link."""
 
@@ -107,14 +85,20 @@ class RobotMap(NamedTuple):
     position: Annotated[Mapping[str, tuple[float, ...]], None] = _NOTHING
 
     def read_joint_limits(self) -> dict[str, JointLimit]:
-        """Return the limits of every movable joint: those of the map, else the URDF's.
+        """Return the limits of every movable joint: those of the map, else the URDF's, zero where that has none.
 
-        Raises
-        ------
-        MissingFile, BadModel
-            The URDF is not there, or not XML; the map has limits of a joint that the URDF lacks.
+        They are read without Pinocchio, so that a check against them shares no code with the controller. `MissingFile`,
+        `BadModel`: the URDF is not there, or is none; the map has limits of a joint that the URDF lacks.
         """
-        limits = read_joint_limits(self.urdf)
+        limits = {}
+        for joint in read_urdf(self.urdf).joints:
+            if joint.type in ("revolute", "continuous", "prismatic"):
+                limit, mimic = joint.limit, joint.mimic
+                lower, upper, velocity = (getattr(limit, key, 0.0) or 0.0 for key in ("lower", "upper", "velocity"))
+                if joint.type == "continuous":
+                    lower, upper = -np.inf, np.inf
+                source = None if mimic is None else (mimic.joint, mimic.multiplier, mimic.offset)
+                limits[joint.name] = JointLimit(joint.type, lower, upper, velocity, source)
         for key, values in (("velocity", self.velocity), ("position", self.position)):
             for name in values:
                 self.check_name(f"limits.{key}", "moving joint", name, limits)

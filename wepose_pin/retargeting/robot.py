@@ -125,7 +125,11 @@ def load_robot(
         pin.framesForwardKinematics(full, data, rest_full)
         base = data.oMf[full.getFrameId(robot.base)]
     R_BT = np.asarray(base.rotation @ _build_rotation(AXES[robot.forward], AXES[robot.up]))
-    geometry = _load_collision_geometry(robot, full)
+    try:
+        folders = package_folders(robot.urdf)
+        geometry = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=folders)
+    except Exception as error:  # what C++ throws
+        raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {reason(error)}") from error
     if robot.table is not None:  # a box whose upper side is so far above the base's origin
         below = pin.SE3(np.eye(3), np.array([0.0, 0.0, robot.table - 0.5 * TABLE_SIZE[2]]))
         box = coal.Box(*TABLE_SIZE)
@@ -199,16 +203,6 @@ def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, Join
         first, size = full.idx_qs[joint], full.nqs[joint]
         q[first : first + size] = value if size == 1 else (np.cos(value), np.sin(value))
     return q
-
-
-def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
-    """Pinocchio's geometry model; empty where the URDF has no collision shapes."""
-    try:
-        return pin.buildGeomFromUrdf(
-            full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=package_folders(robot.urdf)
-        )
-    except Exception as error:  # what C++ throws
-        raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {reason(error)}") from error
 
 
 def _narrow_range(name: str, limit: JointLimit, limit_margin: float) -> tuple[float, float]:
