@@ -171,7 +171,10 @@ def compute_arm_targets(
     WrongOption
         A scale or cut-off out of range.
     """
-    check_scale_and_smoothing(scale, smoothing_hz)
+    if scale is not None and not 0.0 < scale < np.inf:
+        raise WrongOption("scale", f"{scale:g}", "a number above 0 is needed")
+    if not 0.0 <= smoothing_hz < np.inf:
+        raise WrongOption("smoothing-hz", f"{smoothing_hz:g}", "0, which does not smooth, or more is needed")
     time = np.asarray(pose.time, dtype=float)
     if len(time) < 10:
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")
@@ -202,14 +205,6 @@ def compute_arm_targets(
         hands.append(_smooth(time, motion, known, compute_weight(std), arm, smoothing_hz))
         slowdown = np.maximum(slowdown, 1.0 + (MAX_SLOWDOWN - 1.0) * (1.0 - hands[-1].weight))
     return ArmTargets(time, tuple(hands), slowdown, scales)
-
-
-def check_scale_and_smoothing(scale: float | None, smoothing_hz: float) -> None:
-    """Raise `WrongOption` for a scale or cut-off out of range."""
-    if scale is not None and not 0.0 < scale < np.inf:
-        raise WrongOption("scale", f"{scale:g}", "a number above 0 is needed")
-    if not 0.0 <= smoothing_hz < np.inf:
-        raise WrongOption("smoothing-hz", f"{smoothing_hz:g}", "0, which does not smooth, or more is needed")
 
 
 def compute_target_reach(robot: Robot, arm: Arm) -> float:

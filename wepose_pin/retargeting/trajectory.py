@@ -180,13 +180,14 @@ def retarget(
     check_arguments(retarget, locals())
     check_rate(rate_hz)
     pose, body_table = _select_pose(pose, interval, phase)
-    stated = {"arm": arm, "speed_scale": speed_scale, "limit_margin": limit_margin}
+    stated = {"speed_scale": speed_scale, "limit_margin": limit_margin}
+    margins = {name: value for name, value in stated.items() if value is not None}
     if not isinstance(robot, Robot):
-        margins = {"speed_scale": speed_scale, "limit_margin": limit_margin}
-        chosen = {name: value for name, value in margins.items() if value is not None}
-        robot = load_robot(find_map(str(robot)), list_sides(arm), **chosen)
-    elif any(value is not None for value in stated.values()):
-        raise BadOption(f"{', '.join(stated)}: a Robot has arms and margins of its own; `load_robot` takes them")
+        robot = load_robot(find_map(str(robot)), list_sides(arm), **margins)
+    elif arm is not None or margins:
+        raise BadOption(
+            "arm, speed_scale, limit_margin: a Robot has arms and margins of its own; give `load_robot` them"
+        )
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
     arm_targets = compute_arm_targets(pose, robot, table=table or body_table, scale=scale, smoothing_hz=smoothing_hz)
