@@ -63,7 +63,7 @@ class Tree(NamedTuple):
 
     def neutral(self, link: str) -> np.ndarray:
         """Return the placement (4, 4) of `link` in the root link, all joints at zero."""
-        return reduce(np.matmul, map(joint_placement, self.path(link)), np.eye(4))
+        return reduce(np.matmul, (joint.origin for joint in self.path(link)), np.eye(4))
 
     def hanging(self, start: str, others: Collection[str] = ()) -> list[str]:
         """Return `start` and the links below it, without the links `others` and what is below them."""
@@ -94,9 +94,9 @@ def parse_tree(robot: Any, where: str) -> Tree:
             raise BadModel(f"{where}: link '{joint.child}' hangs on two joints; a body is a tree")
         above[joint.child] = joint
         below[joint.parent].append(joint)
-        axis, place = () if joint.axis is None else joint.axis, joint_placement(joint)
-        numbers = np.concatenate([np.ravel(place), np.ravel(axis)]).astype(float)
-        if place.shape != (4, 4) or np.shape(axis) not in ((0,), (3,)) or not (np.abs(numbers) < _FAR).all():
+        axis = () if joint.axis is None else joint.axis
+        numbers = np.concatenate([np.ravel(joint.origin), np.ravel(axis)]).astype(float)
+        if np.shape(joint.origin) != (4, 4) or np.shape(axis) not in ((0,), (3,)) or not (np.abs(numbers) < _FAR).all():
             raise BadModel(f"{where}: joint '{joint.name}': origin or axis is not three numbers each, of m and rad")
     roots = [name for name in below if name not in above]
     if len(roots) != 1:
@@ -217,7 +217,7 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
         inertial = links[link].inertial
         if inertial is None or not inertial.mass:
             return
-        placement = pin.SE3.Identity() if inertial.origin is None else pin.SE3(np.asarray(inertial.origin, dtype=float))
+        placement = pin.SE3(inertial.origin)
         inertia = np.asarray(inertial.inertia if inertial.inertia is not None else np.zeros((3, 3)), dtype=float)
         # The constructor refuses what no body can have, as some URDFs state it; Pinocchio's own reader does not.
         total = pin.Inertia.Zero()
@@ -230,7 +230,7 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
         model.addFrame(pin.Frame(link, parent, 0, M_JL, pin.FrameType.BODY), False)
         carry(link, parent, M_JL)
         for first in tree.below[link]:
-            M_Jc = M_JL * pin.SE3(joint_placement(first))
+            M_Jc = M_JL * pin.SE3(first.origin)
             triple, own_axes = _find_triple(first, tree, links) if spherical else ([], None)
             child = [first, *triple][-1].child
             if first.type == "fixed":
@@ -239,24 +239,19 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
                 grow(child, _add_single(model, parent, M_Jc, first, where), pin.SE3.Identity())
             else:
                 for joint in triple[1:]:
-                    M_Jc = M_Jc * pin.SE3(joint_placement(joint))
+                    M_Jc = M_Jc * pin.SE3(joint.origin)
                 joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
                 if own_axes is not None:
                     axes[child] = own_axes
                 # The links between the axes, as they stand at zero.
                 M_cK = pin.SE3.Identity()
                 for joint in triple[:0:-1]:
-                    M_cK = M_cK * pin.SE3(joint_placement(joint)).inverse()
+                    M_cK = M_cK * pin.SE3(joint.origin).inverse()
                     carry(joint.parent, joints[child], M_cK)
                 grow(child, joints[child], pin.SE3.Identity())
 
     grow(tree.root, 0, pin.SE3.Identity())
     return model, joints, axes
-
-
-def joint_placement(joint: Any) -> np.ndarray:
-    """Return the placement (4, 4) of a joint, and so of its child at zero, in its parent link."""
-    return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float)
 
 
 def joint_axis(joint: Any) -> np.ndarray:
@@ -279,10 +274,10 @@ def _find_triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> tuple[list
             return [], None
         chain.append(below[0])
     turn = all(joint.type in ("revolute", "continuous") for joint in chain)
-    meet = all(np.linalg.norm(joint_placement(joint)[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
+    meet = all(np.linalg.norm(joint.origin[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
     axes = np.array([joint_axis(joint) for joint in chain])
     for k, joint in enumerate(chain):
-        axes[:k] = axes[:k] @ joint_placement(joint)[:3, :3]
+        axes[:k] = axes[:k] @ joint.origin[:3, :3]
     is_triple = turn and meet and np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE
     return (chain, axes) if is_triple else ([], None)
 
@@ -342,7 +337,7 @@ def stretch_robot(robot: Any, table: BodyTable, targets: Mapping[str, float]) ->
         return R_WK.T @ (np.eye(3) + sum((ratios[name] - 1.0) * P for name, P in parts.items())) @ R_WK
 
     for joint in robot.joints:
-        if joint.name in of_joints and joint.origin is not None:
+        if joint.name in of_joints:
             joint.origin[:3, 3] = stretch(of_joints[joint.name], placed[joint.parent]) @ joint.origin[:3, 3]
     for link in robot.links:
         if link.name in of_links:
@@ -403,8 +398,6 @@ def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretche
 def _stretch_link(link: Any, S: np.ndarray) -> None:
     """Stretch visuals, collisions and inertia of a link by S (3, 3) in its own coordinates."""
     for visual in [*link.visuals, *link.collisions]:
-        if visual.origin is None:
-            visual.origin = np.eye(4)
         along = np.linalg.norm(S @ visual.origin[:3, :3], axis=0)  # of the visual's own axes
         visual.origin[:3, 3] = S @ visual.origin[:3, 3]
         geometry = visual.geometry
@@ -418,8 +411,6 @@ def _stretch_link(link: Any, S: np.ndarray) -> None:
     inertial = link.inertial
     if inertial is None or not inertial.mass:
         return
-    if inertial.origin is None:
-        inertial.origin = np.eye(4)
     R, volume = inertial.origin[:3, :3], float(np.linalg.det(S))
     inertial.origin[:3, 3] = S @ inertial.origin[:3, 3]
     inertial.mass *= volume
@@ -459,7 +450,7 @@ def measure_reaches(
             if not model.existFrame(joint.parent):
                 continue  # between the axes of a spherical joint
             link = names[model.frames[model.getFrameId(joint.parent)].parentJoint]
-            step = tree.neutral(joint.parent)[:3, :3] @ joint_placement(joint)[:3, 3]
+            step = tree.neutral(joint.parent)[:3, :3] @ joint.origin[:3, 3]
             parts = stretches.get(joint.name, {})
             columns = [parts[name] @ step if name in parts else np.zeros(3) for name in own]
             vectors = np.column_stack([*columns, step - np.sum(columns, axis=0) if columns else step])

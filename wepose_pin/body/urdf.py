@@ -21,7 +21,7 @@ EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 
 
 def read_urdf(path: Path) -> Any:
-    """The URDF as yourdfpy has it."""
+    """The URDF as yourdfpy has it; each joint, shape and inertia states its origin (4, 4)."""
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a URDF is wanted here")
     try:
@@ -36,10 +36,14 @@ def read_urdf(path: Path) -> Any:
         if isinstance(error, KeyError):
             reason = f"an element lacks the attribute {reason}"
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
-    for shape in (shape for link in robot.links for shape in (*link.visuals, *link.collisions)):
+    shapes = [shape for link in robot.links for shape in (*link.visuals, *link.collisions)]
+    for shape in shapes:
         mesh = None if shape.geometry is None else shape.geometry.mesh
         if mesh is not None and mesh.filename:
             mesh.filename = str(find_mesh(mesh.filename, path) or mesh.filename)
+    inertials = [link.inertial for link in robot.links if link.inertial is not None]
+    for part in (*robot.joints, *shapes, *inertials):
+        part.origin = np.eye(4) if part.origin is None else part.origin
     materials = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
     for material in [*robot.materials, *materials]:
         if material.texture is not None and material.texture.filename is None:
@@ -134,10 +138,9 @@ def list_visuals(robot: Any) -> list[Visual]:
         if (material := visual.material) is not None:
             rgba = material.color.rgba if material.color is not None else colours.get(material.name, rgba)
         r, g, b, a = (float(v) for v in rgba)
-        M = np.eye(4) if visual.origin is None else visual.origin
-        quat, sizes = Rotation.from_matrix(M[:3, :3]).as_quat(), tuple(float(v) for v in size)
+        quat, p_LV = Rotation.from_matrix(visual.origin[:3, :3]).as_quat(), visual.origin[:3, 3].copy()
         file = mesh.filename if kind == "mesh" else None
-        visuals.append(Visual(name, kind, sizes, quat, M[:3, 3].copy(), (r, g, b, a), file))
+        visuals.append(Visual(name, kind, tuple(float(v) for v in size), quat, p_LV, (r, g, b, a), file))
     return visuals
 
 

@@ -18,7 +18,7 @@ from ..body import BodyModel
 from ..body.configuration import compute_pose, solve_configuration
 from ..body.kinematics import find_usual_rate
 from ..body.links import compute_joint_values
-from ..body.tree import joint_axis, joint_placement, parse_tree
+from ..body.tree import joint_axis, parse_tree
 from ..body.urdf import read_urdf
 from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
@@ -228,7 +228,7 @@ def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
     """Compute the transform of every link but the root, parents before children."""
     transforms = {}
     for joint in motion.ordered:
-        origin = joint_placement(joint)
+        origin = joint.origin
         quat, p = Rotation.from_matrix(origin[:3, :3]).as_quat()[None], origin[None, :3, 3]
         if joint.type in _ONE_AXIS:
             source, factor, offset = joint.name, 1.0, 0.0
