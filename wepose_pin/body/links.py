@@ -188,78 +188,52 @@ def compute_point_covariances(
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return {}
         return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov)
+    R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
+    table, neutral, n = model.table, model.neutral_rotations, len(next(iter(quat_WL.values())))
+    lengths, girdles = np.array(list(model.lengths.values())), list(table.girdles)
+    moved = {name: move_girdle(model, name, quat_WL) for name in girdles if table.girdles[name].on in R_WL}
     covariances: dict[str, np.ndarray] = {}
-    for point, parts in _find_ways(model, quat_WL, points).items():
-        vectors: dict[str, np.ndarray] = {}  # segment → the sum of what rotates with it
-        for segment, vector, *_ in parts:
-            if segment is not None:
-                vectors[segment] = vectors.get(segment, 0.0) + vector
-        if not parts or not set(vectors) <= set(segment_cov):
+    for point in points:
+        names, links = model.point_girdles[point], model.reaches[point]
+        carriers = {link: UNIVERSE if link == UNIVERSE else find_carrier(model, link, R_WL) or "" for link in links}
+        if "" in carriers.values() or not set(names) <= set(moved) or not (links or names):
             continue
-        columns = [column for _, _, own, _, _ in parts for column in own]
-        J = np.concatenate([jacobian for _, _, _, jacobian, _ in parts], axis=2)
+        vectors: dict[str, np.ndarray] = {}  # segment → the sum of what rotates with it, (n, 3) [m] in W
+        by_lengths = [by_length for by_length, _ in links.values()]
+        own = np.flatnonzero(np.concatenate([np.zeros((1, len(lengths))), *by_lengths]).any(axis=0))
+        columns, J, off_law = own.tolist(), np.zeros((n, 3, len(own))), np.zeros((n, 3, 3))
+        for link, (by_length, constant) in links.items():
+            carrier = carriers[link]
+            R_WK = np.eye(3) if carrier == UNIVERSE else R_WL[carrier]
+            if carrier != link:
+                R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
+            J += R_WK @ by_length[:, own]
+            if carrier != UNIVERSE:
+                vectors[carrier] = vectors.get(carrier, 0.0) + R_WK @ (by_length @ lengths + constant)
+        for name in names:
+            on, first = table.girdles[name].on, len(lengths) + len(PARAMETERS) * girdles.index(name)
+            (displacement, jacobian, residual), R_on = moved[name], R_WL[on]
+            columns += range(first, first + len(PARAMETERS))
+            J = np.concatenate([J, R_on @ jacobian], axis=2)
+            vectors[on] = vectors.get(on, 0.0) + np.einsum("nij,nj->ni", R_on, displacement)
+            off_law += (R_on * residual[:, None, :]) @ R_on.swapaxes(1, 2)
+        if not set(vectors) <= set(segment_cov):
+            continue
         # Sample by sample: the bits of one large product would depend on the number of samples.
         cov = J @ shape_cov[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
         for segment, vector in vectors.items():
-            skew = np.zeros((len(vector), 3, 3))  # [v]×
+            skew = np.zeros((n, 3, 3))  # [v]×
             skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
             skew = skew - skew.swapaxes(1, 2)
             cov += skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
-        for *_, residual in parts:
-            cov += residual
         for (near, far), shared in heading_cov.items():
             if near in vectors and far in vectors:
                 # A heading error ε moves the end of a vector by ε e_z × v.
                 a, b = (np.stack([-vectors[name][:, 1], vectors[name][:, 0]], axis=1) for name in (near, far))
                 outer = shared[:, None, None] * a[:, :, None] * b[:, None, :]
                 cov[:, :2, :2] += outer + outer.swapaxes(1, 2)
-        covariances[point] = cov
+        covariances[point] = cov + off_law
     return covariances
-
-
-# A part of the way from the root to a point: the segment with which it rotates (None: the root), the vector (n, 3) [m]
-# in W, the parameters of the shape that change it, its Jacobian (n, 3, c) by these, and the covariance (n, 3, 3) [m²]
-# in W by which it leaves what the shape says.
-_Part = tuple[str | None, np.ndarray, Sequence[int], np.ndarray, np.ndarray | float]
-
-
-def _find_ways(
-    model: BodyModel, quat_WL: Mapping[str, np.ndarray], points: Sequence[str]
-) -> dict[str, tuple[_Part, ...]]:
-    """Find the parts of the ways to a person's points; none where one follows no measured segment."""
-    R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
-    lengths, neutral = np.array(list(model.lengths.values())), model.neutral_rotations
-    n = len(next(iter(quat_WL.values())))
-    known: dict[Any, _Part | None] = {}
-    for k, (name, girdle) in enumerate(model.table.girdles.items()):
-        if girdle.on in R_WL:
-            displacement, jacobian, residual = move_girdle(model, name, quat_WL)
-            R_on, first = R_WL[girdle.on], len(lengths) + len(PARAMETERS) * k
-            vector = np.einsum("nij,nj->ni", R_on, displacement)
-            cov = (R_on * residual[:, None, :]) @ R_on.swapaxes(1, 2)
-            known[name] = girdle.on, vector, range(first, first + len(PARAMETERS)), R_on @ jacobian, cov
-
-    def find_part(link: str, by_length: np.ndarray, constant: np.ndarray) -> _Part | None:
-        carrier = None if link == UNIVERSE else find_carrier(model, link, R_WL)
-        if carrier is None and link != UNIVERSE:
-            return None
-        R_WK = np.broadcast_to(np.eye(3), (n, 3, 3)) if carrier is None else R_WL[carrier]
-        if carrier is not None and carrier != link:
-            R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
-        columns = np.flatnonzero(by_length.any(axis=0)).tolist()
-        return carrier, R_WK @ (by_length @ lengths + constant), columns, R_WK @ by_length[:, columns], 0.0
-
-    ways: dict[str, tuple[_Part, ...]] = {}
-    for point in points:
-        parts = []
-        for link, vector in model.reaches[point].items():
-            key = (link, *(each.tobytes() for each in vector))  # points of a limb share parts
-            known[key] = known[key] if key in known else find_part(link, *vector)
-            parts.append(known[key])
-        parts += [known.get(name) for name in model.point_girdles[point]]
-        own = tuple(part for part in parts if part is not None)
-        ways[point] = own if len(own) == len(parts) else ()
-    return ways
 
 
 def _propagate_through_joints(
