@@ -102,13 +102,9 @@ def make_record(**values: Any) -> np.ndarray:
 
     A step is compiled for the types of the record, and a parameter may be stated as an integer.
     """
-    dtype = _make_dtype(
-        *(
-            (name, value.dtype if isinstance(value, np.generic | np.ndarray) else float, np.shape(value))
-            for name, value in values.items()
-        )
-    )
-    return np.array([tuple(values.values())], dtype)
+    typed = {name: v if isinstance(v, np.generic | np.ndarray) else np.float64(v) for name, v in values.items()}
+    dtype = _make_dtype(*((name, value.dtype, value.shape) for name, value in typed.items()))
+    return np.array([tuple(typed.values())], dtype)
 
 
 @cache
