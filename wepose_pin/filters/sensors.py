@@ -1,4 +1,4 @@
-"""The filters of sensors, whole or sample by sample: `SensorFilters`, and `filter_recording` for a whole recording."""
+"""The filters of sensors, whole or sample by sample: `SensorFilters`, which `start_filters` starts on a recording."""
 
 from __future__ import annotations
 
