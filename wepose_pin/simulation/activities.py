@@ -53,9 +53,9 @@ class WholeBodyActivity(Activity):
             self.p_LS[f"{side}_shank"] = np.array((0.06, 0.0, -0.36 * lengths[f"{side}_shank"]))
             self.p_LS[f"{side}_foot"] = np.array((0.4 * lengths[f"{side}_foot"], 0.0, 0.0))
 
-    @abstractmethod
-    def leg(self, side: str, t: np.ndarray) -> np.ndarray:
+    def leg(self, _side: str, t: np.ndarray) -> np.ndarray:
         """Compute the angles of hip, knee and ankle (3, n, 3) [rad] at the times `t` (n,) [s], as `angles.JOINTS`."""
+        return np.zeros((3, len(t), 3))
 
     @abstractmethod
     def trunk(self, t: np.ndarray) -> np.ndarray:
@@ -265,9 +265,6 @@ class Throw(WholeBodyActivity):
                 at = STAND_S + k * self._PERIOD_S + 0.5 + begin
                 angles += np.outer(make_step(t, at, duration), size * change)
         return angles
-
-    def leg(self, _side: str, t: np.ndarray) -> np.ndarray:
-        return np.zeros((3, len(t), 3))
 
     def trunk(self, t: np.ndarray) -> np.ndarray:
         turn, lean = self._angles(t)[:, 4:].T

@@ -342,9 +342,9 @@ class Motion(BodyMotion):
         lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         lean[:, 1:] += flaws.sway_torso(t)
         R_WT = turn_about("ZYX", lean)
-        for part in self.schedule:
-            if part.kind == "bow":
-                R_WT = compose(make_bow(make_pulse(t, *part.pulse), self.bow_axis), R_WT)
+        across = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
+        for part in (part for part in self.schedule if part.kind == "bow"):
+            R_WT = compose(Rotation.from_rotvec(BOW * make_pulse(t, *part.pulse)[:, None] * across), R_WT)
         starting = 1.0 - make_step(t, STAND_S, _LEAD_S)
         R_WT = compose(R_WT, Rotation.from_rotvec(starting[:, None] * start_pose.torso))
 
@@ -432,12 +432,6 @@ def _schedule(parts: Sequence[str], begin: float, end: float) -> list[_Part]:
         schedule.append(_Part(kind, at, at + own))
         at += own + change
     return schedule
-
-
-def make_bow(share: np.ndarray, axis_angle: float) -> Rotation:
-    """Make a bow by shares (n,) of `BOW` about an axis that is so far [rad] from y."""
-    axis = np.array((-np.sin(axis_angle), np.cos(axis_angle), 0.0))
-    return Rotation.from_rotvec(BOW * share[:, None] * axis)
 
 
 def aim_ray(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:

@@ -75,10 +75,8 @@ class Wander:
         self.phase = rng.uniform(0.0, 2.0 * np.pi, 4)
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
-        total = np.zeros_like(t)
-        for frequency_hz, phase in zip(self.frequency_hz, self.phase, strict=True):
-            total += np.sin(2.0 * np.pi * frequency_hz * t + phase) / np.sqrt(10.0 * frequency_hz)
-        return np.tanh(0.9 * total)
+        waves = np.sin(t[:, None] * (2.0 * np.pi * self.frequency_hz) + self.phase)
+        return np.tanh(0.9 * (waves / np.sqrt(10.0 * self.frequency_hz)).sum(axis=1))
 
 
 class Sway:
