@@ -18,7 +18,6 @@ joint's acceleration, since orientation and specific force are the sensor's.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from ..body.tree import UNIVERSE
 from ..filters.butterworth import band_pass
 from ..filters.sensors import FilteredRecording
-from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, linearize_joint
+from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, find_neighbours, linearize_joint
 from ..recording import Recording
 from .equations import Gaussian, Layout
 from .least_squares import LEAST_CORRELATION_S, LeastSquares
@@ -38,6 +37,9 @@ SEARCH_SAMPLES, LEAST_SEARCH_SAMPLES = 48, 8  # of all closures together, of eac
 GAP_STD = 0.03  # [m] of a closure; includes errors of the lengths and all that the search leaves out
 KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount
 OUTLIER = 5.0  # standard deviations of a sample, at which it has a quarter of its weight
+# Couplings of neighbours: H (c, m), whose product with x (m,) is the heading ψ of the sensor nearer the root less that
+# of the far one, mean over the samples; this heading as it was observed (c,), and its standard deviation (c,) [rad].
+Couplings = tuple[np.ndarray, np.ndarray, np.ndarray]
 _FIFTHS = 2.0 * np.pi / 5.0 * np.arange(5)
 SAMPLES_HZ = 10.0  # of couplings
 LEAST_S = 20.0  # of motion that is used
@@ -54,7 +56,7 @@ MAX_STD = np.deg2rad(20.0)  # above it the problem is not linear
 # Search ---------------------------------------------------------------------------------------------------------------
 
 
-def search_headings(fit: LeastSquares, stated: Mapping[str, float], couplings: Sequence[Coupling] = ()) -> np.ndarray:
+def search_headings(fit: LeastSquares, stated: Mapping[str, float], couplings: Couplings | None) -> np.ndarray:
     """Return the headings ψ (sensors,) [rad] of the lowest minimum.
 
     Lengths are those of its x; `stated` has the ψ of sensors with a stated mount, others may be
@@ -79,7 +81,7 @@ def wrap_angle(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _collect_terms(fit: LeastSquares, couplings: Sequence[Coupling]) -> tuple[np.ndarray, np.ndarray]:
+def _collect_terms(fit: LeastSquares, couplings: Couplings | None) -> tuple[np.ndarray, np.ndarray]:
     """Return c (n, 3) and F (sensors, 5, n, 3) in units of their standard deviations.
 
     They are those of closures at some of their samples, of poses and bows on average, and of couplings.
@@ -128,10 +130,10 @@ def _collect_terms(fit: LeastSquares, couplings: Sequence[Coupling]) -> tuple[np
             turn = Q[condition.segment].as_rotvec().sum(axis=0) * [1.0, 1.0, 0.0]  # forwards: about the axis
             turn = turn / max(float(np.linalg.norm(turn)), 1e-9)
             add(condition.std, -np.array([condition.axis]), {condition.segment: _turn_about_z(turn)})
-    for coupling in couplings:
-        ahead = np.array([np.cos(coupling.heading), np.sin(coupling.heading), 0.0])
-        parts = {coupling.near: _turn_about_z(np.array([1.0, 0.0, 0.0])), coupling.far: -_turn_about_z(ahead)}
-        add(coupling.std, np.zeros((1, 3)), parts)
+    for H, heading, std in zip(*couplings, strict=True) if couplings else ():
+        near, far = (sensors[int(at(H[layout.heading]))] for at in (np.argmax, np.argmin))
+        ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+        add(std, np.zeros((1, 3)), {near: _turn_about_z(np.array([1.0, 0.0, 0.0])), far: -_turn_about_z(ahead)})
     return np.concatenate(constants), np.concatenate(harmonics, axis=2)
 
 
@@ -207,50 +209,34 @@ def _turn_by_hinges(fit: LeastSquares, headings: np.ndarray) -> float:
 # Couplings
 
 
-class Coupling(NamedTuple):
-    """The heading of one sensor's world relative to that of its neighbour."""
-
-    near: str
-    far: str
-    heading: float  # [rad] ψ of the near one less ψ of the far one, mean over the samples
-    std: float  # [rad]
-    elapsed_s: float  # from the start pose to the mean time of the samples
-
-
 def estimate_couplings(
-    recording: Recording, filtered: FilteredRecording, pairs: Sequence[tuple[str, str]], samples: np.ndarray
-) -> list[Coupling]:
-    """Return those of each joint between two IMUs, from the motion in these samples (n,); none where it is too short.
-
-    `pairs` are of neighbouring segments, the one nearer the root first.
-    """
-    pairs = [pair for pair in pairs if set(pair) <= set(recording.imus)]
+    recording: Recording, filtered: FilteredRecording, layout: Layout, samples: np.ndarray
+) -> Couplings | None:
+    """Return those of each joint between two IMUs, from the motion in these samples (n,); None: it is too short."""
+    neighbours = find_neighbours(layout.model, layout.sensors)
+    pairs = [pair for pair in neighbours if set(pair) <= set(recording.imus)]
     if recording.rate_hz < LEAST_RATE_HZ or len(samples) < LEAST_S * recording.rate_hz:
-        return []
+        return None
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]
     names = dict.fromkeys(name for pair in pairs for name in pair)
     sides = {name: compute_joint_sides(recording, filtered, name)[samples] for name in names}
     elapsed_s = float(np.mean(recording.time[samples]) - filtered.start[1])
-    couplings = []
-    for near, far in pairs:
-        heading, std = estimate_heading(sides[near], sides[far])
-        if std < MAX_STD:
-            couplings.append(Coupling(near, far, heading, float(np.hypot(std, SYSTEMATIC_STD)), elapsed_s))
-    return couplings
-
-
-def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]) -> Gaussian:
-    """Return the prior of x with the headings and drifts of the couplings, whole turns as at its mean."""
-    mean, information = prior
-    H = np.zeros((len(couplings), layout.size))
-    for row, coupling in zip(H, couplings, strict=True):
-        for name, sign in ((coupling.near, 1.0), (coupling.far, -1.0)):
+    H, heading, std = np.zeros((len(pairs), layout.size)), np.empty(len(pairs)), np.empty(len(pairs))
+    for row, pair in enumerate(pairs):
+        heading[row], std[row] = estimate_heading(*(sides[name] for name in pair))
+        for name, sign in zip(pair, (1.0, -1.0), strict=True):
             i = layout.sensors.index(name)
-            row[layout.heading[i]], row[layout.drift[i]] = sign, sign * coupling.elapsed_s
-    off = wrap_angle(np.array([coupling.heading for coupling in couplings]) - H @ mean)
-    weighted = H.T * np.array([coupling.std**-2 for coupling in couplings])
+            H[row, layout.heading[i]], H[row, layout.drift[i]] = sign, sign * elapsed_s
+    known = std < MAX_STD
+    return H[known], heading[known], np.hypot(std, SYSTEMATIC_STD)[known]
+
+
+def add_couplings(prior: Gaussian, couplings: Couplings) -> Gaussian:
+    """Return the prior of x with the headings and drifts of the couplings, whole turns as at its mean."""
+    (mean, information), (H, heading, std) = prior, couplings
+    weighted = H.T / std**2
     information = information + weighted @ H
-    return mean + np.linalg.solve(information, weighted @ off), information
+    return mean + np.linalg.solve(information, weighted @ wrap_angle(heading - H @ mean)), information
 
 
 def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name: str) -> np.ndarray:

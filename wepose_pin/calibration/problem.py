@@ -25,11 +25,10 @@ from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
-from ..observations.joint_accelerations import find_neighbours
 from ..recording import Recording, format_span
 from ..recording.gaps import find_runs
 from .equations import Gaussian, Layout
-from .headings import Coupling, estimate_couplings
+from .headings import Couplings, estimate_couplings
 from .protocols import Closure, Condition, FreeMotion, Protocol
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
@@ -41,6 +40,20 @@ FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phas
 # Standard deviations [rad] of a stated mount's heading, as mounts name sensor axes that are estimated by eye, and of an
 # unknown heading: the whole circle.
 STATED_STD, HEADING_STD = np.deg2rad(10.0), np.pi / np.sqrt(3.0)
+
+MOST_LAYOUTS = 4  # that are remembered
+_layouts: dict[tuple[Any, ...], Layout] = {}
+
+
+def find_layout(protocol: Protocol, model: BodyModel, recording: Recording) -> Layout:
+    """Return the layout of a protocol on a body, an earlier one where it is the same: its functions take 60 ms."""
+    joints, sensors = tuple(recording.joints.items()), tuple(recording.sensors)
+    key = id(model), protocol, recording.start_pose, joints, sensors  # a layout keeps its model alive
+    layout = _layouts.get(key) or Layout(protocol, model, recording)
+    _layouts[key] = layout
+    for oldest in list(_layouts)[:-MOST_LAYOUTS]:
+        _layouts.pop(oldest, None)
+    return layout
 
 
 @dataclass(frozen=True)
@@ -210,13 +223,12 @@ class CalibrationProblem:
         return self.connected[0] & ~np.any([np.zeros(len(self.recording), dtype=bool), *gaps], axis=0)
 
     @cached_property
-    def couplings(self) -> list[Coupling]:
+    def couplings(self) -> Couplings | None:
         """The relative headings of neighbours by the acceleration of the joint between them."""
         phases = zip(self.layout.conditions, self.phase_samples, strict=True)
         moving = [phase for condition, phase in phases if isinstance(condition, Closure | FreeMotion)]
         samples = np.unique(np.concatenate([np.zeros(0, dtype=int), *moving]))
-        pairs = find_neighbours(self.model, self.layout.sensors)
-        return estimate_couplings(self.recording, self.filtered, pairs, samples[self.usable[samples]])
+        return estimate_couplings(self.recording, self.filtered, self.layout, samples[self.usable[samples]])
 
     def diagnose_losses(self) -> list[Diagnostic]:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""

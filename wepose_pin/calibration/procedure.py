@@ -44,7 +44,7 @@ from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
 from .headings import add_couplings, search_headings
 from .least_squares import CONTRADICTED, LeastSquares, compare_measured, estimate_covariance, solve_reweighted
 from .paper import Formulation, solve_paper_calibration
-from .problem import SAMPLE_RATE_HZ, CalibrationProblem
+from .problem import SAMPLE_RATE_HZ, CalibrationProblem, find_layout
 from .protocols import Closure, FreeMotion, Protocol, choose_protocol, load_protocol
 from .result import LEAST_ROTATION, Calibration, assess, measure_doubt, measure_rotations
 
@@ -150,8 +150,7 @@ def calibrate(
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:  # the two calibrations are fused, each on the population prior
         prior = separate_mounts(earlier, population_subject(body=model))
-    layout = Layout(protocol, model, recording)
-    problem = CalibrationProblem(recording, filtered, layout, prior, lengths)
+    problem = CalibrationProblem(recording, filtered, find_layout(protocol, model, recording), prior, lengths)
     calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
     if earlier is not None:
         fused = fuse_calibrations(earlier, calibration.subject, model.table)
@@ -244,11 +243,11 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
     mean, information = build_prior(layout, problem.prior, problem.measured, sensors)
     weights, contact = np.ones((len(samples), layout.residuals)), np.ones(len(samples))
     fit = LeastSquares(layout, data, condition_index, (mean, information), mean.copy(), weights, contact)
-    couplings = [] if quick and problem.protocol.closures else problem.couplings
+    couplings = None if quick and problem.protocol.closures else problem.couplings
     headings = search_headings(fit, problem.stated_headings, couplings)
     is_free = [name not in problem.stated_headings for name in layout.sensors]
     mean[layout.heading[is_free]] = headings[is_free]
-    prior = add_couplings((mean, information), layout, couplings)
+    prior = add_couplings((mean, information), couplings) if couplings else (mean, information)
     start = fit.place_points(prior[0])
     # The weight of a gap in the initial guess: near 0 where the palms are apart.
     contact = (1.0 + np.sum(fit.measure_gaps(start) ** 2, axis=1) / WIDE**2) ** -2
