@@ -64,9 +64,9 @@ def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(record
         stepped = tracker.step(gyro[k], accel[k])
         for i, name in enumerate(tracker.names):
             assert np.array_equal(stepped[i], pose.quat_WL[name][k - begin]), (name, k)
-        if k % 7 == 0 and pose.segments.covariance_W:
+        if k % 7 == 0 and pose.pose.segment_cov:
             covariance = [tracker.compute_covariance(i) for i in range(len(tracker.names))]
-            stated = [pose.segments.covariance_W[name][k - begin] for name in tracker.names]
+            stated = [pose.pose.segment_cov[name][k - begin] for name in tracker.names]
             np.testing.assert_allclose(covariance, stated, rtol=1e-9, atol=1e-12, err_msg=f"{k}")
     assert pose.time[0] == recording.time[begin]
     assert recording.phases["start"][0][1] < pose.time[0]

@@ -243,7 +243,7 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
     assert rms[False][LIMB[1:]] < 2.0
     correction = tracked.correction
     assert correction is not None
-    assert set(correction.summarize()["joint_accelerations"]) == {
+    assert set(tracked.summary["heading_correction"]["joint_accelerations"]) == {
         f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")
     }
     rows = tracked.time[tracked.time > 30.0][::20]

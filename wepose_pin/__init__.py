@@ -16,7 +16,7 @@ Conventions, everywhere:
   and nothing else.
 - Attitude errors are rotation vectors [rad], true = estimated with the error on one side. On the right, in S:
   `R_VS exp(θ_S)`, covariances of filters (`attitude_cov`). On the left, in W: `exp(θ_W) R_WL`, covariances of segments
-  (`covariance_W`, `Pose.segment_cov`) and heading errors δ, θ_W = δ e_z. On the left, in L: `exp(ε_L) R_LS`, mounts.
+  (`Pose.segment_cov`) and heading errors δ, θ_W = δ e_z. On the left, in L: `exp(ε_L) R_LS`, mounts.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is correct
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -41,14 +41,6 @@ class HeadingCorrection:
         """Segment → largest rotation about the vertical."""
         largest = np.degrees(np.max(np.abs(self.errors), axis=0, initial=0.0))
         return dict(zip(self.filter.names, largest.tolist(), strict=True))
-
-    def summarize(self) -> dict[str, Any]:
-        """What was observed and the largest correction of each heading, as ``summary.json`` has it."""
-        return {
-            "joint_accelerations": [far for _, far in self.filter.pairs],
-            "hinges": [hinge.name for hinge in self.filter.hinges],
-            "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
-        }
 
     def interpolate(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the corrections (n, k) [rad] and the variances (n, k) [rad²] of segments' headings at times [s]."""
@@ -239,12 +231,9 @@ class HeadingCorrector:
         var = np.diag(self._estimate[2])
         self.variance = np.array([var, self._var_at_knot, (self._to - self._at_reset) ** 2])
 
-    def collect(self) -> HeadingCorrection:
-        """Return what was observed and corrected causally so far."""
-        return self._stack(self._history)
-
-    def _stack(self, knots: list[tuple[Any, ...]]) -> HeadingCorrection:
-        k = len(self.offset)
+    def collect(self, knots: Sequence[tuple[Any, ...]] | None = None) -> HeadingCorrection:
+        """Return what was observed and corrected causally so far; or `knots`, as `HeadingFilter.estimate` each."""
+        knots, k = self._history if knots is None else knots, len(self.offset)
         columns = zip(((k,), (k, k), (k, k)), zip(*knots, strict=True) if knots else ((), (), ()), strict=True)
         values = (np.array(values).reshape(-1, *shape) for shape, values in columns)
         return HeadingCorrection(self.filter, np.array(self._times), *values)
@@ -270,7 +259,7 @@ class HeadingCorrector:
             P = symmetric(before_P + gain @ (P - forward.P) @ gain.T)
             estimates.append(forward.estimate(x, P, care))
             process = process_before
-        smoothed = self._stack(estimates[::-1])
+        smoothed = self.collect(estimates[::-1])
         if measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
             smoothed.errors[:, measured] = 0.0
         return smoothed

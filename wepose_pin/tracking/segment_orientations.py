@@ -29,9 +29,6 @@ class SegmentOrientations:
     quat_LS: Mapping[str, np.ndarray]  # segment → (4,) xyzw, the mount used
     heading_offset: Mapping[str, float]  # segment → ψ [rad], heading of its sensor's world V in W
     orientation: Mapping[str, Orientation]  # segment → result of its sensor's filter, in V; of IMUs alone
-    # Segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's covariance, the
-    # tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. None of ncf and gdc.
-    covariance_W: Mapping[str, np.ndarray]
     start: tuple[float, float]  # [s] from which headings and mounts are
     static_phase: tuple[float, float]  # [s] from which noise and bias are
     diagnostics: tuple[Diagnostic, ...]  # of the recording, its start pose and its mounts
@@ -55,7 +52,9 @@ def compute_segment_covariance(
     R_LS: Rotation,
     attitude_cov: np.ndarray,
 ) -> np.ndarray:
-    """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
+    """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left, without soft tissue.
+
+    It is the sum of the filter's, the tilt by the accelerometer's bias, and the uncertainty of mount and start pose.
 
     Parameters
     ----------

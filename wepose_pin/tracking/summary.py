@@ -184,8 +184,15 @@ class TrackSummary:
                 "joints": {name: {"min": round(a, 5), "max": round(b, 5)} for name, (a, b) in self._joints.items()},
                 "undetermined_joints": self.undetermined_joints,
             }
+        corrected = None
+        if correction is not None:
+            corrected = {
+                "joint_accelerations": [far for _, far in correction.filter.pairs],
+                "hinges": [hinge.name for hinge in correction.filter.hinges],
+                "largest_correction_deg": {name: round(v, 3) for name, v in correction.max_correction_deg.items()},
+            }
         return content | {
-            "heading_correction": None if correction is None else correction.summarize(),
+            "heading_correction": corrected,
             "error_budget_mm": {
                 point: {part: round(1e3 * std, 1) for part, std in parts.items()}
                 for point, parts in self.error_budget.items()

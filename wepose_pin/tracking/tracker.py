@@ -355,7 +355,6 @@ class Tracker:
             quat_LS=dict(zip(self.names, self._quat_LS, strict=True)),
             heading_offset=dict(zip(self.names, self._heading_offset.tolist(), strict=True)),
             orientation=orientation,
-            covariance_W=covariances,
             start=self._start,
             static_phase=self._static_phase,
             diagnostics=self.diagnostics,
@@ -457,8 +456,9 @@ def track_chunks(
 ) -> Iterator[TrackResult]:
     """Iterate over a recording's chunks with their poses: results of a day that are too long for memory.
 
-    The smoother's is one chunk. Errors are those of the new `tracker`. Chunks last `chunk_s` [s], the first one as much
-    longer as the phases `start` and `static` need; `progress` is called with the share that is done.
+    The `tracker` is a new one, and errors are its own. Chunks last `chunk_s` [s], the first one as much longer as the
+    phases `start` and `static` need, and the smoother's as long as the recording. `progress` is called with the share
+    that is done.
     """
     begin, end = float(recording.time[0]), float(recording.time[-1])
     spans = [recording.phases[phase][0] for phase in ("start", "static") if recording.phases.get(phase)]
