@@ -113,23 +113,23 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
 
 def build_tables(movements: Sequence[Movement]) -> dict[str, pl.DataFrame]:
     """Build all tables, by the names of their files; one without rows is empty."""
-    repetitions = build_repetition_table(movements)
+    angles = [angle_table(each.angles).select(pl.lit(each.name).alias("session"), pl.all()) for each in movements]
+    repeating = [each for each in movements if len(each.repetitions.spans)]
+    repetitions = _concat([_tabulate_spans(each, _list_repetitions(each)) for each in repeating])
     summary = build_summary_table(movements, repetitions)
     return {
-        "angles": build_angle_table(movements),
+        "angles": pl.concat(angles, how="diagonal"),
         "sessions": build_session_table(movements),
         "repetitions": repetitions,
-        "phases": build_phase_table(movements),
+        "phases": _concat([_tabulate_spans(each, _list_phases(each)) for each in movements]),
         "summary": summary,
         "curves": build_curve_table(movements),
         "comparison": build_comparison_table(summary),
     }
 
 
-def build_angle_table(movements: Sequence[Movement]) -> pl.DataFrame:
-    """Build a row a sample of each session: its angles as `angle_table` has them."""
-    tables = [angle_table(each.angles).select(pl.lit(each.name).alias("session"), pl.all()) for each in movements]
-    return pl.concat(tables, how="diagonal")
+def _concat(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    return pl.concat(tables) if tables else pl.DataFrame()
 
 
 def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
@@ -157,28 +157,20 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
     return pl.DataFrame(rows, schema_overrides={"low_pass_hz": pl.Float64})
 
 
-def build_phase_table(movements: Sequence[Movement]) -> pl.DataFrame:
-    """Build a row an angle in all of the selected time, and in each interval of a phase that lies in it."""
-    tables = []
-    for movement in movements:
-        time = movement.angles.time
-        about = [{"phase": "all", "number": 1, "from_s": float(time[0]), "to_s": float(time[-1])}]
-        for name, spans in movement.phases.items():
-            about += [{"phase": name, "number": k, "from_s": a, "to_s": b} for k, (a, b) in enumerate(spans, 1)]
-        tables.append(_tabulate_spans(movement, about))
-    return pl.concat(tables)
+def _list_phases(movement: Movement) -> list[dict[str, Any]]:
+    """List all of the selected time, and each interval of a phase that lies in it."""
+    time = movement.angles.time
+    about = [{"phase": "all", "number": 1, "from_s": float(time[0]), "to_s": float(time[-1])}]
+    for name, spans in movement.phases.items():
+        about += [{"phase": name, "number": k, "from_s": a, "to_s": b} for k, (a, b) in enumerate(spans, 1)]
+    return about
 
 
-def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
-    """Build a row an angle in each repetition."""
-    tables = []
-    for movement in movements:
-        about = [
-            {"repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
-            for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
-        ]
-        tables += [_tabulate_spans(movement, about)] if about else []
-    return pl.concat(tables) if tables else pl.DataFrame()
+def _list_repetitions(movement: Movement) -> list[dict[str, Any]]:
+    return [
+        {"repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
+        for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
+    ]
 
 
 def _tabulate_spans(movement: Movement, about: Sequence[Mapping[str, Any]]) -> pl.DataFrame:
@@ -232,7 +224,7 @@ def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 degrees = {f"{part}_deg": np.degrees(getattr(curve, part)) for part in ("mean", "sd", "std")}
                 table = pl.DataFrame({"percent": PERCENT, "n": curve.n} | degrees)
                 tables.append(table.select(*(pl.lit(text).alias(key) for key, text in about.items()), pl.all()))
-    return pl.concat(tables) if tables else pl.DataFrame()
+    return _concat(tables)
 
 
 def build_comparison_table(summary: pl.DataFrame) -> pl.DataFrame:

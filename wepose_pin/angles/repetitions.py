@@ -86,19 +86,21 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
     main_angle : as ``right_elbow_flexion``; None: that of `find_main_angle`; `WrongOption`: there is no such angle
     rising : the angle grows first in a repetition; None: by where it rests
     """
-    known = list_angles(angles)
-    if main_angle is not None and main_angle not in known:
-        raise WrongOption("main-angle", main_angle, f"no such angle in the result; {one_of(known, main_angle, 30)}")
+    places = list_angles(angles)
+    if main_angle is not None and main_angle not in places:
+        raise WrongOption("main-angle", main_angle, f"no such angle in the result; {one_of(places, main_angle, 30)}")
     source = main_angle or find_main_angle(angles)
     if source is None:
         limits = f"{100 * MAX_NEAR_LOCK:g} % of the time, or in gaps for over {100 * MAX_GAP:g} %"
         return Repetitions(_NO_SPANS, "", reason=f"each angle is near gimbal lock for over {limits}")
-    joint, k = known[source]
+    joint, k = places[source]
     values, hidden = angles[joint].values[:, k], angles[joint].hidden(k)
     none = Repetitions(_NO_SPANS, source)
     if np.count_nonzero(~hidden) < 10:
         return none._replace(reason="the angle is not determined for even 10 samples")
-    signal = _smooth(angles.time, np.interp(angles.time, angles.time[~hidden], values[~hidden]))
+    rate_hz = 1.0 / float(np.median(np.diff(angles.time)))
+    known = np.interp(angles.time, angles.time[~hidden], values[~hidden])
+    signal = low_pass(known, min(CUTOFF_HZ, 0.4 * rate_hz), rate_hz)
     low, high = np.percentile(signal, [2.0, 98.0])
     if high - low < MIN_RANGE:
         reason = f"the angle has a range of {np.degrees(high - low):.1f}°, and {np.degrees(MIN_RANGE):.0f}° are needed"
@@ -129,11 +131,6 @@ def _are_alike(curves: np.ndarray) -> np.ndarray:
     usual -= usual.mean()
     size = np.linalg.norm(centred, axis=1) * np.linalg.norm(usual)
     return np.asarray(centred @ usual >= MIN_CORRELATION * np.maximum(size, 1e-12))
-
-
-def _smooth(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    rate_hz = 1.0 / float(np.median(np.diff(time)))
-    return low_pass(values, min(CUTOFF_HZ, 0.4 * rate_hz), rate_hz)
 
 
 def _rests_low(signal: np.ndarray, low: float, high: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..errors import BadOption, WrongOption
 from .options import MORE, Angle, Force, Hz, Interval, Out, PhaseName, described_by
@@ -74,7 +74,8 @@ def angles(
     with progress_bar() as progress:
         with whole_folder(out, force) as folder:
             # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
-            sequence, source, rising = str(shoulder), main_angle, None
+            chosen: dict[str, Any] = {"sequence": shoulder, "cutoff_hz": low_pass_hz, "phase": repetitions}
+            chosen["main_angle"] = main_angle
             movements: list[Movement] = []
             for k, each in enumerate((result, *further), 1):
                 progress("reading", 0.7 * (k - 1) / (1 + len(further)))
@@ -82,22 +83,13 @@ def angles(
                 pose, name = select_pose(tracked, interval, phase), tracked.name
                 name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
                 try:
-                    movement = build.analyze_movement(
-                        name,
-                        pose,
-                        tracked.phases,
-                        sequence=sequence,
-                        cutoff_hz=low_pass_hz,
-                        phase=repetitions,
-                        main_angle=source,
-                        rising=rising,
-                    )
+                    movement = build.analyze_movement(name, pose, tracked.phases, **chosen)
                 except WrongOption as error:
                     raise BadOption(f"{each}: {error}" if further else str(error)) from None
                 movements.append(movement)
-                sequence = movement.sequence or sequence
+                chosen["sequence"] = movement.sequence or chosen["sequence"]
                 if repetitions is None and len(movement.repetitions.spans):
-                    source, rising = movement.repetitions.source, movement.repetitions.rising
+                    chosen |= {"main_angle": movement.repetitions.source, "rising": movement.repetitions.rising}
             progress("writing", 0.7)
             tables = build.build_tables(movements)
             for name, table in tables.items():

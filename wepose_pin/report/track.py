@@ -216,13 +216,13 @@ def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
             ranges = [f"{number(a, 0)} to {number(b, 0)}" for a, b in zip(low, high, strict=True)]
             std = 1e3 * compute_axis_std(covs[name])[after_start] if name in covs else np.full(1, np.nan)
             stds = [spread(each(std), 0, " mm") for each in (finite_median, finite_max)]
-            rows.append([plain(name), *ranges, f"{measures.peak_speed[name]:.1f} m/s", *stds])
-        items.append(Table(f"The {title}", ["", *AXES, "highest speed", "median ±", "largest ±"], rows))
+            rows.append([plain(name), *ranges, *stds])
+        items.append(Table(f"The {title}", ["", *AXES, "median ±", "largest ±"], rows))
     if not items:
         return []
     items.append(
-        "Ranges hold 98 % of the time; the highest speed is the mean of a tenth of a second. The ± is of one axis, "
-        "relative to the root, and includes the lean and the lengths of all that lies between."
+        "Ranges hold 98 % of the time. The ± is of one axis, relative to the root, and includes the lean and the "
+        "lengths of all that lies between."
     )
     return [*items, *tabulate_error_budget(measures.error_budget)]
 

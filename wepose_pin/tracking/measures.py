@@ -24,7 +24,6 @@ from ..recording.sensors import compute_rate
 from .result import TrackResult
 from .segment_orientations import compute_heading_variance, compute_soft_tissue_covariance
 
-PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
 PERIOD_S = 1.0  # [s] from one sample of the error budget to the next
 SOURCES = ("soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle")  # of the error budget
 
@@ -111,13 +110,6 @@ def measure_reach(pose: Pose, table: BodyTable) -> dict[str, np.ndarray]:
         if np.isfinite(reach).all(axis=1).any():
             reaches[name] = reach
     return reaches
-
-
-def compute_peak_speed(reach: np.ndarray, rate_hz: float) -> float:
-    """Compute the highest speed [m/s] of a point's reach (n, 3) [m], each the mean over `PEAK_OVER_S`."""
-    size = max(1, round(PEAK_OVER_S * rate_hz))
-    peak = float(np.nan_to_num(np.linalg.norm(reach[size:] - reach[:-size], axis=1)).max(initial=0.0))
-    return peak * rate_hz / size
 
 
 def find_samples_after_start(tracked: TrackResult) -> np.ndarray:

@@ -17,16 +17,13 @@ from ..filters import STATIC_ONLY, Orientation, join_orientations
 from ..recording import Recording
 from ..recording.gaps import find_runs
 from .measures import (
-    PEAK_OVER_S,
     compute_error_budget,
     compute_heading_stds,
     compute_joint_heading_stds,
-    compute_peak_speed,
     find_samples_after_start,
     finite_max,
     longest_run_s,
     measure_hinge,
-    measure_reach,
     measure_signal,
 )
 from .result import TrackResult
@@ -57,7 +54,6 @@ class TrackSummary:
     Attributes
     ----------
     last : the last chunk
-    peak_speed : tip → [m/s]
     """
 
     last: TrackResult
@@ -67,7 +63,6 @@ class TrackSummary:
         self._poses: list[Pose] = []  # decimated, as the orientations
         self._orientations: dict[str, list[Orientation]] = {}
         self._static: dict[str, list[np.ndarray]] = {}
-        self.peak_speed: dict[str, float] = {}
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
         self._joints: dict[str, tuple[float, float]] = {}  # of a mechanism: least and most
 
@@ -83,11 +78,6 @@ class TrackSummary:
         for segment, orientation in tracked.segments.orientation.items():
             self._static.setdefault(segment, []).append(orientation.static)
             self._orientations.setdefault(segment, []).append(orientation.take(rows))
-        rate_hz, pose = tracked.recording.rate_hz, tracked.pose
-        if self._samples:  # from the chunk before into this one
-            pose = join_poses([self.last.pose.cut(slice(-max(1, round(PEAK_OVER_S * rate_hz)), None)), pose])
-        for name, reach in measure_reach(pose, tracked.model.table).items():
-            self.peak_speed[name] = max(self.peak_speed.get(name, 0.0), compute_peak_speed(reach, rate_hz))
         residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.segments.quat_WL)
         for segment, angle in residuals.items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
