@@ -48,9 +48,11 @@ def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> n
 
 def compute_segment_covariance(
     mounting: tuple[Recording, str, Subject | None, StartPose],
-    quat_WS: np.ndarray,
     R_LS: Rotation,
-    attitude_cov: np.ndarray,
+    filtered: tuple[np.ndarray, np.ndarray],
+    heading_offset: np.ndarray,
+    variance: np.ndarray,
+    lost: np.ndarray | None = None,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left, without soft tissue.
 
@@ -59,11 +61,16 @@ def compute_segment_covariance(
     Parameters
     ----------
     mounting : the recording, the segment, the person whose mounts are used, and the start pose
-    quat_WS, R_LS : (n, 4) xyzw of the sensor, and its mount
-    attitude_cov : (n, 3, 3) [rad²] the filter's, in S, error on the right
+    R_LS : the sensor's mount
+    filtered : of its filter, `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its error, in S on the right
+    heading_offset : (n,) ψ [rad]
+    variance : (n, 3) [rad²] as `HeadingCorrector.variance`; NaN: the heading is that of the filter
+    lost : (n,) bool: the sensor is lost, and neighbours do not tell where its segment is
     """
-    recording, segment, subject, start_pose = mounting
-    R = Rotation.from_quat(quat_WS).as_matrix()
+    (recording, segment, subject, start_pose), (quat_VS, attitude_cov) = mounting, filtered
+    vertical = np.array([0.0, 0.0, 1.0])
+    quat_WV = rotations.rotation_about(vertical, heading_offset)
+    R = Rotation.from_quat(rotations.multiply(quat_WV, quat_VS)).as_matrix()
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
@@ -72,7 +79,6 @@ def compute_segment_covariance(
     R_WL = R @ start_pose.to_world(segment, R_LS).inv().as_matrix()
     mount_cov = find_mount_covariance(recording, segment, subject, start_pose)
     start_var = start_pose.std(segment) ** 2
-    vertical = np.array([0.0, 0.0, 1.0])
     if mount_cov is not None and subject is not None:  # whose mount it is
         error_jacobian = R_WL - np.outer(vertical, vertical)
         if segment not in subject.start_pose_offset:
@@ -87,44 +93,25 @@ def compute_segment_covariance(
         # The tilt of a stated mount is gravity's in the start pose, so that it has the error of the start pose.
         error_jacobian, mount_cov = R_WL, np.diag([start_var[0], start_var[1], 0.0])
     cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
-    cov_W[:, 2, 2] += compute_start_heading_var(*mounting)
-    return cov_W
-
-
-def correct_covariance(
-    cov_W: np.ndarray,
-    filtered: tuple[np.ndarray, np.ndarray],
-    heading_offset: np.ndarray,
-    start_var: float,
-    variance: np.ndarray,
-    lost: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return the covariances (n, 3, 3) [rad²] of a segment in W, `cov_W`, with the variance of its corrected heading.
-
-    Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
-
-    Parameters
-    ----------
-    filtered : of the sensor's filter, `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its error, in S
-    heading_offset, start_var : ψ (n,) or (1,) [rad], and its variance [rad²] by the start pose
-    variance : (n, 3) [rad²] as `HeadingCorrector.variance`
-    lost : (n,) bool: the sensor is lost, and neighbours do not tell where its segment is
-    """
-    R_VS, attitude_cov, vertical = Rotation.from_quat(filtered[0]), filtered[1], np.array([0.0, 0.0, 1.0])
+    start_heading_var = compute_start_heading_var(*mounting)
+    cov_W[:, 2, 2] += start_heading_var
+    if np.isnan(variance).any():
+        return cov_W
+    # Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
+    R_VS = Rotation.from_quat(quat_VS)
     with_heading_V = R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply(vertical)))  # with each axis
-    alone = with_heading_V[:, 2] + start_var
+    alone = with_heading_V[:, 2] + start_heading_var
     known, at_knot, correction = variance.T
     # The filter alone may know the heading better; to it a correction is an error of that size.
     corrected = np.minimum(known + np.maximum(with_heading_V[:, 2] - at_knot, 0.0), alone + correction)
     if lost is not None:
         corrected = np.where(lost, np.maximum(corrected, alone), corrected)
-    with_heading_W = Rotation.from_rotvec(heading_offset[:, None] * vertical).apply(with_heading_V)
+    with_heading_W = Rotation.from_quat(quat_WV).apply(with_heading_V)
     removed = (1.0 - np.sqrt(corrected / alone))[:, None] * with_heading_W
-    replaced = cov_W.copy()
-    replaced[:, 2, :2] -= removed[:, :2]
-    replaced[:, :2, 2] -= removed[:, :2]
-    replaced[:, 2, 2] += corrected - alone
-    return replaced
+    cov_W[:, 2, :2] -= removed[:, :2]
+    cov_W[:, :2, 2] -= removed[:, :2]
+    cov_W[:, 2, 2] += corrected - alone
+    return cov_W
 
 
 def compute_soft_tissue_covariance(table: BodyTable, quat_WL: Mapping[str, np.ndarray], segment: str) -> np.ndarray:

@@ -25,7 +25,6 @@ from ..body.mounts import (
     align_sensors,
     collect_nominal_mounts,
     compute_heading_offset,
-    compute_start_heading_var,
     find_start_pose,
 )
 from ..body.soft_tissue import make_correction
@@ -50,7 +49,6 @@ from .segment_orientations import (
     compute_heading_variance,
     compute_segment_covariance,
     compute_soft_tissue_covariance,
-    correct_covariance,
 )
 from .start_pose import START_POSE_HOLD_S, split_start_pose
 
@@ -312,7 +310,7 @@ class Tracker:
     def _find_covariance(self, i: int, placed: tuple[np.ndarray, ...], lost: np.ndarray | None) -> np.ndarray | None:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment in W, error on the left; None: there is none.
 
-        `placed` is that of `_place`, `lost` as in `correct_covariance`.
+        `placed` is that of `_place`, `lost` as in `compute_segment_covariance`.
         """
         name, (quat_VS, attitude_cov, _, offset, variance, lost_s) = self.names[i], (own[:, i] for own in placed)
         if self._measured[i]:
@@ -325,13 +323,8 @@ class Tracker:
         soft = compute_soft_tissue_covariance(self._start_pose.table, quat_WL, name)
         if self._first.sensors[name].aligned:
             return np.asarray(attitude_cov + soft)
-        quat_WS = rotations.multiply(rotations.rotation_about(E_Z, offset), quat_VS)
-        mounting = self._first, name, self._subject, self._start_pose
-        cov = compute_segment_covariance(mounting, quat_WS, Rotation.from_quat(self._quat_LS[i]), attitude_cov) + soft
-        if np.isnan(variance).any():
-            return cov
-        start_var = compute_start_heading_var(*mounting)
-        return correct_covariance(cov, (quat_VS, attitude_cov), offset, start_var, variance, lost)
+        mounting, R_LS = (self._first, name, self._subject, self._start_pose), Rotation.from_quat(self._quat_LS[i])
+        return compute_segment_covariance(mounting, R_LS, (quat_VS, attitude_cov), offset, variance, lost) + soft
 
     def _solve_pose(self, chunk: Recording, placed: _Placed, correction: HeadingCorrection | None) -> TrackResult:
         """Return a chunk with its pose; the correction of a causal tracker is in its headings."""
