@@ -16,9 +16,8 @@ Sources: the C3D File Format user guide (c3d.org); HAS-Motion's description of R
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,7 +49,7 @@ def is_reference(path: Path) -> bool:
 
 
 def read_reference(path: Path, markers: Path | None = None) -> Reference:
-    """Read what another system measured; `markers`: a table of markers that goes before the shipped one."""
+    """Read what another system measured; `markers`: a table whose entries replace the shipped ones."""
     check_file(path, "a C3D, TRC or MVNX")
     suffix = path.suffix.lower()
     if suffix == ".mvnx":
@@ -165,32 +164,21 @@ class MarkerTable(NamedTuple):
     points: Mapping[str, Sequence[Sequence[str]]]
     segments: Mapping[str, Sequence[Mapping[str, Sequence[Sequence[str]]]]]
     rotations: Mapping[str, str]
-    own: Mapping[str, Sequence[Sequence[str]]] = MappingProxyType({})  # points of the user's table
+    stated: Collection[str]  # points of the user's table
 
 
 def read_marker_table(path: Path | None = None) -> MarkerTable:
-    """Read a table of markers; None: the shipped one. What a user's table has goes before that."""
-    table = _read_table(Path(__file__).with_name("markers.toml"))
-    if path is None:
-        return table
-    own = _read_table(path)
-
-    def join(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
-        return {name: [*theirs.get(name, ()), *ours.get(name, ())] for name in {**ours, **theirs}}
-
-    points, segments = join(table.points, own.points), join(table.segments, own.segments)
-    return MarkerTable(points, segments, {**table.rotations, **own.rotations}, own.points)
-
-
-def _read_table(path: Path) -> MarkerTable:
-    top = TomlTable(read_toml(path, "a table of markers"), str(path))
-    top.allow(*_FORMS)
-    entries: dict[str, Any] = {key: top.table(key, {}).values for key in _FORMS}
-    for key, form in _FORMS.items():
-        for name, entry in entries[key].items():
-            if not _has_form(key, entry):
-                raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
-    return MarkerTable(**entries)
+    """Read the shipped table of markers; entries of a user's table replace its own."""
+    entries: dict[str, dict[str, Any]] = {key: {} for key in _FORMS}
+    for file in filter(None, (Path(__file__).with_name("markers.toml"), path)):
+        top = TomlTable(read_toml(file, "a table of markers"), str(file))
+        top.allow(*_FORMS)
+        for key, form in _FORMS.items():
+            for name, entry in top.table(key, {}).values.items():
+                if not _has_form(key, entry):
+                    raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
+                entries[key][name] = entry
+    return MarkerTable(**entries, stated=top.table("points", {}).values if path else ())
 
 
 def _has_form(key: str, value: Any) -> bool:
@@ -198,7 +186,9 @@ def _has_form(key: str, value: Any) -> bool:
     if key == "rotations" or not isinstance(value, list):
         return key == "rotations" and isinstance(value, str)
     if key == "points":
-        return all(isinstance(way, list) and way and all(isinstance(name, str) for name in way) for way in value)
+        return bool(value) and all(
+            isinstance(way, list) and way and all(isinstance(name, str) for name in way) for way in value
+        )
     return all(
         isinstance(frame, dict)
         and len(frame) == len({DIRECTIONS[name] for name in frame if name in DIRECTIONS}) == 2
@@ -216,10 +206,9 @@ def _locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tab
         if way is not None:
             points[name] = np.mean([known[each] for each in way], axis=0)
             known.setdefault(name, points[name])
-    for name, ways in table.own.items():
-        lost = [marker for way in ways for marker in way if marker not in known]
-        if lost and not any(set(way) <= set(known) for way in ways):
-            raise BadData(f"{path}: no marker '{lost[0]}', by which {name} is stated; {one_of(markers, lost[0])}")
+        elif name in table.stated:
+            lost = next(marker for way in ways for marker in way if marker not in known)
+            raise BadData(f"{path}: no marker '{lost}', by which {name} is stated; {one_of(markers, lost)}")
     quats = {}
     for segment, frames in table.segments.items():
         for frame in frames:

@@ -155,7 +155,7 @@ def load_result(folder: str | Path) -> TrackResult:
         summary |= json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
         diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
         marks = tuple(Mark(float(time), str(text)) for time, text in summary.get("recorded_marks", ()))
-    model, subject = load_model(folder / SUBJECT_URDF), load_subject(folder)
+    subject, model = load_subject(folder), load_model(folder / SUBJECT_URDF)
     if model.table.girdles:
         model = replace(model, girdles=subject.girdles)
     name, phases = str(summary.get("recording") or folder.name), read_phases(summary)
