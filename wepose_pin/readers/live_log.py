@@ -1,6 +1,6 @@
 """The recording of a live session: its inputs and its poses, as MCAP, which Foxglove and others open.
 
-Messages are JSON with JSON schemas (`SCHEMAS`); their log time is that of the newest sample, on the source's clock. The
+Messages are JSON with JSON schemas; their log time is that of the newest sample, on the source's clock. The
 file is in chunks, so that what was written before a session was killed is readable.
 
 docs/live.md lists the topics. Events are ``clock`` when ticks began, ``start`` (``begin``, ``end``: ticks) the start
@@ -37,16 +37,6 @@ LONGEST_RECORD = 1 << 28  # [bytes] longer than any that we write
 MOST_RATE = 10_000.0
 LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text
 KIND = "a recording of wepose live"
-_VECTOR = {"type": "array", "items": {"type": "number"}}
-SCHEMAS: dict[str, dict[str, Any]] = {
-    name: {"type": "object", "properties": properties}
-    for name, properties in {
-        "sample": {"t": {"type": "number"}, "gyro": _VECTOR, "accel": _VECTOR},
-        "orientation": {"t": {"type": "number"}, "orientation": _VECTOR},
-        "pose": {"tick": {"type": "integer"}, "quat_WL": {"type": "object", "additionalProperties": _VECTOR}},
-        "event": {"kind": {"type": "string"}},
-    }.items()
-}
 
 
 class Markers:

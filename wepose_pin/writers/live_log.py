@@ -15,7 +15,7 @@ import numpy as np
 from mcap.writer import Writer
 
 from ..errors import ExistingOutput
-from ..readers.live_log import EVENTS, FORMAT, HEADER, POSES, PROFILE, SCHEMAS, SENSORS
+from ..readers.live_log import EVENTS, FORMAT, HEADER, POSES, PROFILE, SENSORS
 from ..recording.arrivals import Arrivals
 
 FLUSH_S = 0.25  # [s] what a kill may cost at most
@@ -95,7 +95,7 @@ class LiveLog:
         self._writer.add_metadata(HEADER, {"json": json.dumps({"format": FORMAT, **header})})
         schemas = {
             name: self._writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
-            for name, schema in SCHEMAS.items()
+            for name, schema in json.loads(Path(__file__).with_suffix(".json").read_text()).items()
         }
         self._channels = [
             self._writer.register_channel(SENSORS + name, "json", schemas["orientation" if measured else "sample"])

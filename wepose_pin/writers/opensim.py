@@ -50,7 +50,7 @@ _AXES = (0.22604696, 0.022269, 0.97386183), _PRONATION, (0.0, 0.0, 1.0), (1.0, 0
 # an elbow that was once bent as none can be might keep a full turn too much.
 _MIDDLE = {"elbow_flex": np.radians(75.0), "pro_sup": np.radians(90.0), "wrist_flex": 0.0, "wrist_dev": 0.0}
 _MIRRORED = np.array([-1.0, -1.0, 1.0, 1.0])  # xyzw, z → −z
-_ROUNDS, _DAMPING = 40, 1e-9  # of Gauss-Newton; about ten are the rule
+_ROUNDS = 200  # of the fit of an arm
 _CLOSE = 1e-9  # [rad] of the last step
 
 
@@ -260,49 +260,28 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
 def _fit_arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """Fit the humerus (n, 4) and the angles of elbow and wrist to `quat` (n, 4) of humerus, radius and perhaps hand.
 
-    And how far each body is off; angles are (n,) [rad].
+    And how far each body is off; angles are (n,) [rad]. By turns the joints take the angles that are the best for the
+    radius, and the radius the mean of where the measured bodies put it: each lessens the sum of the squared angles.
     """
-    axes = [np.array(axis) / np.linalg.norm(axis) for axis in _AXES[: 2 * len(quat) - 2]]
-    starts: list[np.ndarray] = []
-    for k in range(len(quat) - 1):
-        starts += _solve_two_axes(axes[2 * k], axes[2 * k + 1], multiply(conjugate(quat[k]), quat[k + 1]))
-    angles, humerus = np.column_stack(starts), quat[0]
+    axes = [np.array(axis) / np.linalg.norm(axis) for axis in _AXES]
+    humerus, radius = quat[:2]
+    pace = 1.5 if len(quat) > 2 else 1.0  # where joints follow the radius on both sides, its mean lags behind
     for _ in range(_ROUNDS):
-        error, J = _body_errors(humerus, angles, axes, quat)
-        A = np.swapaxes(J, 1, 2) @ J + _DAMPING * np.eye(J.shape[2])
-        step = -np.linalg.solve(A, np.swapaxes(J, 1, 2) @ error[:, :, None])[:, :, 0]
-        humerus = multiply(humerus, np.column_stack([0.5 * step[:, :3], np.ones(len(humerus))]))
-        humerus /= np.linalg.norm(humerus, axis=1)[:, None]
-        angles = angles + step[:, 3:]
+        angles = _solve_two_axes(axes[0], axes[1], multiply(conjugate(humerus), radius))
+        elbow = multiply(rotation_about(axes[0], angles[0]), rotation_about(axes[1], angles[1]))
+        placed = [multiply(humerus, elbow), quat[1]]
+        if len(quat) > 2:
+            angles += _solve_two_axes(axes[2], axes[3], multiply(conjugate(radius), quat[2]))
+            wrist = multiply(rotation_about(axes[2], angles[2]), rotation_about(axes[3], angles[3]))
+            placed.append(multiply(quat[2], conjugate(wrist)))
+        off = [Rotation.from_quat(multiply(conjugate(radius), each)).as_rotvec() for each in placed]
+        step = pace * np.mean(off, axis=0)
+        radius = multiply(radius, Rotation.from_rotvec(step).as_quat())
         if np.abs(step).max() < _CLOSE:
             break
-    error, _ = _body_errors(humerus, angles, axes, quat)
-    middle = np.array(list(_MIDDLE.values())[: angles.shape[1]])
-    angles -= 2.0 * np.pi * np.round((angles - middle) / (2.0 * np.pi))
-    return humerus, list(angles.T), [np.linalg.norm(part, axis=1) for part in np.split(error, len(quat), axis=1)]
-
-
-def _body_errors(
-    humerus: np.ndarray, angles: np.ndarray, axes: list[np.ndarray], quat: list[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the rotation vectors (n, 3 m) from the m measured bodies to the model's, and their Jacobian.
-
-    It (n, 3 m, 3 + k) is by a turn of the humerus on its right and by the k angles; of a rotation vector that of the
-    turn, which makes the gradient of its square exact.
-    """
-    n = len(humerus)
-    error, J = np.empty((n, 3 * len(quat))), np.zeros((n, 3 * len(quat), 3 + angles.shape[1]))
-    body = humerus
-    columns = np.tile(np.eye(3), (n, 1, 1))  # what moves the body, in its own axes: (n, 3, …)
-    for m, measured in enumerate(quat):
-        for k in (2 * m - 2, 2 * m - 1) if m else ():
-            turn = rotation_about(axes[k], angles[:, k])
-            body = multiply(body, turn)
-            back = Rotation.from_quat(conjugate(turn)).as_matrix()
-            columns = np.concatenate([back @ columns, np.tile(axes[k][:, None], (n, 1, 1))], axis=2)
-        error[:, 3 * m : 3 * m + 3] = Rotation.from_quat(multiply(conjugate(measured), body)).as_rotvec()
-        J[:, 3 * m : 3 * m + 3, : columns.shape[2]] = columns
-    return error, J
+    middles = list(_MIDDLE.values())
+    angles = [a - 2.0 * np.pi * np.round((a - m) / (2.0 * np.pi)) for a, m in zip(angles, middles, strict=False)]
+    return multiply(radius, conjugate(elbow)), angles, [np.linalg.norm(each, axis=1) for each in off]
 
 
 def _solve_two_axes(a: np.ndarray, b: np.ndarray, quat: np.ndarray) -> list[np.ndarray]:
