@@ -125,19 +125,15 @@ class OrientationFilter(NamedTuple):
 
     V is the sensor's own world: z up, heading of the `quat_VS` from which the filter starts. A run, the same run cut in
     two, and a run sample by sample are bit-identical. A sample that is no number was lost.
-
-    Parameters
-    ----------
-    make_records : noise, rate_hz, quat_VS (4,), params → the records
-    run : takes the records, samples `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²], `static` (n,) bool, and the
-        arrays `quat_VS`, `gyro_bias` and with a covariance `attitude_cov`, `about_vertical` of an `Orientation`, which
-        it fills; all arrays are contiguous
-    params_type : of its parameters, if it has any
     """
 
+    # of the noise, rate_hz, quat_VS (4,), and params
     make_records: Callable[[SensorNoise, float, np.ndarray, Any], tuple[np.ndarray, ...]]
+    # Takes the records, samples `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²], `static` (n,) bool, and the arrays
+    # `quat_VS`, `gyro_bias` and with a covariance `attitude_cov`, `about_vertical` of an `Orientation`, which it fills;
+    # all are contiguous.
     run: Callable[..., None]
-    params_type: type | None = None
+    params_type: type | None = None  # of its parameters, if it has any
     has_covariance: bool = True
 
 

@@ -35,25 +35,17 @@ MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise and bias of one sensor from a static phase.
+    """Noise and bias of one sensor from a static phase."""
 
-    Parameters
-    ----------
-    gyro_bias : (3,) mean of gyro [rad/s]
-    gyro_bias_cov : (3, 3) covariance of that mean [rad²/s²], slow motion in the phase included (a person sways)
-    gyro_cov : (3, 3) Σ̂_ω, sample covariance of gyro [rad²/s²]
-    accel_cov : (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
-    bias_step_cov : (3, 3) Σ_b, covariance of the first differences of gyro [rad²/s²], as in the authors' software
-    gravity : mean norm of accel [m/s²]: the gravity scale
-    gyro_half_second_cov : (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; None: white noise
-    """
-
-    gyro_bias: np.ndarray
-    gyro_bias_cov: np.ndarray
-    gyro_cov: np.ndarray
-    accel_cov: np.ndarray
-    bias_step_cov: np.ndarray
-    gravity: float
+    gyro_bias: np.ndarray  # (3,) mean of gyro [rad/s]
+    gyro_bias_cov: np.ndarray  # (3, 3) [rad²/s²] of that mean, slow motion in the phase included (a person sways)
+    gyro_cov: np.ndarray  # (3, 3) Σ̂_ω, sample covariance of gyro [rad²/s²]
+    accel_cov: np.ndarray  # (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
+    bias_step_cov: (
+        np.ndarray
+    )  # (3, 3) Σ_b, covariance of gyro's first differences [rad²/s²], as in the authors' software
+    gravity: float  # mean norm of accel [m/s²]: the gravity scale
+    # (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; None: white noise
     gyro_half_second_cov: np.ndarray | None = None
 
     def sway_density(self, rate_hz: float) -> float:
