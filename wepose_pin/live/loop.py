@@ -229,27 +229,26 @@ class LiveLoop(Stage):
         return (RESET, *marks, MARK, MARK_TEXT)
 
     def do(self, action: Action, text: str) -> None:
-        text = text[:LONGEST_TEXT]
+        text, time_s = text[:LONGEST_TEXT], self._stream.newest
         if action.name == RESET.name:
             if self._is_tracking:
                 self._tracker.reset_headings()
                 self.log.event("reset", tick=self._stream.clock.next_tick)
             for output in self.outputs:
                 output.resume()
+        elif action.name in self._open_phases:
+            phase = self._open_phases.pop(action.name)
+            self.log.event("end", phase=phase, time=time_s)
+            self._tracker.mark_phase(phase, begins=False)
         elif action.name in (BEGIN_TAKE.name, BEGIN_PHASE.name):
-            begins = action.name not in self._open_phases
-            if begins:
-                self._takes += action.name == BEGIN_TAKE.name
-                phase = f"take_{self._takes}" if action.name == BEGIN_TAKE.name else text or "clasp"
-                self._open_phases[action.name] = phase
-            else:
-                phase = self._open_phases.pop(action.name)
+            self._takes += action.name == BEGIN_TAKE.name
+            phase = f"take_{self._takes}" if action.name == BEGIN_TAKE.name else text or "clasp"
+            self._open_phases[action.name] = phase
             # It begins with the next tick: the ticks before have been tracked without it.
-            time_s = self._stream.newest + (1.0 / self._stream.clock.rate_hz if begins else 0.0)
-            self.log.event("begin" if begins else "end", phase=phase, time=time_s)
-            self._tracker.mark_phase(phase, begins=begins)
+            self.log.event("begin", phase=phase, time=time_s + 1.0 / self._stream.clock.rate_hz)
+            self._tracker.mark_phase(phase, begins=True)
         else:
-            self.log.event("mark", text=text or "mark", time=self._stream.newest)
+            self.log.event("mark", text=text or "mark", time=time_s)
 
     # The state -------------------------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -53,24 +53,24 @@ class SensorMonitor:
         self.keeps_samples = True  # of the last `WINDOW_S`, for `collect` and to find a wrong unit
         self._source = source
         self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
-        self._counts = Counter[str]()  # samples so far
         self._history: dict[str, deque[tuple[float, int]]] = {}  # time [s] and count of the samples of the last second
         self._recent: dict[str, list[Samples]] = {}
 
     def push(self, samples: Iterable[Samples]) -> None:
         """Take samples in their order of arrival."""
+        now = self._source.clock()
         for chunk in samples:
-            time_s = chunk.time[np.isfinite(chunk.time)]
-            if not len(time_s):
+            count = len(chunk.time)
+            first, newest = (float(chunk.time[0]), float(chunk.time[-1])) if count else (math.nan, math.nan)
+            if not (math.isfinite(first) and math.isfinite(newest)):
                 continue
-            first, newest = float(time_s[0]), float(time_s[-1])
-            self._arrived[chunk.sensor], self.sending[chunk.sensor] = self._source.clock(), newest
+            self._arrived[chunk.sensor], self.sending[chunk.sensor] = now, newest
             history = self._history.setdefault(chunk.sensor, deque())
             if not history or abs(first - history[-1][0]) > 1.0:  # a silence, or a clock that was set
                 history.clear()
-                history.append((first, self._counts[chunk.sensor] + 1))
-            self._counts[chunk.sensor] += len(time_s)
-            history.append((max(newest, history[-1][0]), self._counts[chunk.sensor]))
+                history.append((first, 1))
+                count -= 1
+            history.append((max(newest, history[-1][0]), history[-1][1] + count))
             while len(history) > 2 and history[1][0] <= newest - 1.0:
                 history.popleft()
             if self.keeps_samples:
