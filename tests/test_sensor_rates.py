@@ -41,8 +41,9 @@ def test_the_rate_is_that_of_the_sensor_until_it_is_silent(samples: int, late_s:
     assert monitor.update(source.now + 1.1)["torso"] == 0.0
 
 
-def test_a_single_wild_time_changes_the_rate_for_a_moment_only() -> None:
-    monitor, rows = SensorMonitor(LateSource()), np.zeros((1, 3))
+def test_a_single_wild_time_or_value_changes_nothing_for_long() -> None:
+    monitor = SensorMonitor(LateSource())
     for k in [*range(300), 10**6, *range(301, 420)]:
-        monitor.push([Samples("torso", np.array([k / RATE_HZ]), rows, rows)])
+        gyro_S = np.full((1, 3), np.inf if k == 310 else 0.0)
+        monitor.push([Samples("torso", np.array([k / RATE_HZ]), gyro_S, np.ones((1, 3)))])
     assert monitor.update(0.0)["torso"] == pytest.approx(RATE_HZ, abs=1.0)

@@ -152,7 +152,7 @@ def measure_shakes(guide: Guide) -> dict[str, float]:
     rates = {}
     for sensor, newest in guide.monitor.sending.items():
         _, time_s, gyro_S, accel_S = guide.monitor.collect(sensor, SHAKE_WINDOW_S)
-        if guide.now - newest > SHAKE_WINDOW_S or np.ptp(time_s) < 0.75 * SHAKE_WINDOW_S:
+        if guide.now - newest > SHAKE_WINDOW_S or not len(time_s) or np.ptp(time_s) < 0.75 * SHAKE_WINDOW_S:
             continue
         rate = np.linalg.norm(gyro_S, axis=1)
         if sensor in guide.source.orientations:  # from each orientation to the next

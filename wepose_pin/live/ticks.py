@@ -21,7 +21,7 @@ from ..recording.plausibility import check_signals, find_unseen_rate
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
-from .sources.base import Source
+from .sources.base import MAX_VALUES, Source
 from .state import join_names
 
 WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
@@ -81,9 +81,10 @@ class SensorMonitor:
         return [name for name in sensors if now - self.sending.get(name, -math.inf) > silence_s]
 
     def collect(self, sensor: str, seconds: float) -> Samples:
-        """The samples of the newest `seconds` [s]."""
+        """The plausible samples of the newest `seconds` [s]."""
         time_s, gyro_S, accel_S = map(np.concatenate, tuple(zip(*self._recent[sensor], strict=True))[1:])
         rows = (time_s > self.sending[sensor] - seconds) & (time_s <= self.sending[sensor])
+        rows &= (np.abs(np.hstack([gyro_S, accel_S])) <= MAX_VALUES).all(axis=1)
         return Samples(sensor, time_s[rows], gyro_S[rows], accel_S[rows])
 
     def update(self, now: float) -> dict[str, float]:
@@ -100,7 +101,7 @@ class SensorMonitor:
         for name, recent in self._recent.items():
             recent[:] = [self.collect(name, WINDOW_S)]
             ((_, time_s, gyro_S, accel_S),) = recent
-            span_s = float(np.ptp(time_s))
+            span_s = float(np.ptp(time_s)) if len(time_s) else 0.0
             if span_s > 0.9 * WINDOW_S and name not in self._source.orientations:
                 rate = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / span_s)
                 if math.isfinite(rate):
