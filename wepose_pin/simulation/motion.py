@@ -342,8 +342,8 @@ class Motion(BodyMotion):
         lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         lean[:, 1:] += flaws.sway_torso(t)
         R_WT = turn_about("ZYX", lean)
-        across = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
         for part in (part for part in self.schedule if part.kind == "bow"):
+            across = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
             R_WT = compose(Rotation.from_rotvec(BOW * make_pulse(t, *part.pulse)[:, None] * across), R_WT)
         starting = 1.0 - make_step(t, STAND_S, _LEAD_S)
         R_WT = compose(R_WT, Rotation.from_rotvec(starting[:, None] * start_pose.torso))
