@@ -204,11 +204,11 @@ class PoseEncoder:
             self.meshes = build_parts(robot)
             heights = [p_W[find_person_arm(model.table, arm.side).points[0]][2] for arm in robot.arms]
             self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
-            self._robot_joints, self._robot_data = (
-                sorted({part.joint for part in self.meshes}),
-                robot.model.createData(),
-            )
-            self.reach.append(self._place_robot()[:, 9:])
+            self._robot_joints = sorted({part.joint for part in self.meshes})
+            self._robot_data = robot.model.createData()
+            placed = dict(zip(self._robot_joints, self._place_robot(), strict=True))
+            for part in self.meshes:
+                self.reach.append(part.vertices @ placed[part.joint][:9].reshape(3, 3).T + placed[part.joint][9:])
         self.links = self.body_links + tuple(f"robot {joint}" for joint in self._robot_joints)  # as in the frames
 
     def start(self, info: StreamInfo) -> None:
