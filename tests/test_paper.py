@@ -123,6 +123,10 @@ def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulati
         ({"measured": {"trunk": 0.5, "left_hand": 0.07}}, "needs one measured length that fixes the scale"),
         ({"measured": {"shoulder_width": 0.4}, "protocol": "table"}, "points of the body coincide .* not 'table'"),
         ({"measured": {"shoulder_width": 0.4}, "protocol": "t_pose"}, "points of the body coincide .* not 't_pose'"),
+        (
+            {"prior": replace(wp.population_subject(), order=(), covariance=np.zeros((0, 0)))},
+            "lengths need a covariance",
+        ),
         ({"formulation": "linear"}, "formulation = 'linear' is not known; .*full, paper"),
     ],
 )

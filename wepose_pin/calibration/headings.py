@@ -59,8 +59,7 @@ MAX_STD = np.deg2rad(20.0)  # above it the problem is not linear
 def search_headings(fit: LeastSquares, stated: Mapping[str, float], couplings: Couplings | None) -> np.ndarray:
     """Return the headings ψ (sensors,) [rad] of the lowest minimum.
 
-    Lengths are those of its x; `stated` has the ψ of sensors with a stated mount, others may be
-    anywhere.
+    Lengths are those of the fit's x; `stated` has the ψ of sensors with a stated mount, others may be anywhere.
     """
     sensors = fit.layout.sensors
     is_known = np.array([name in stated for name in sensors])

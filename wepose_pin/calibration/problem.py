@@ -40,13 +40,12 @@ FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phas
 # Standard deviations [rad] of a stated mount's heading, as mounts name sensor axes that are estimated by eye, and of an
 # unknown heading: the whole circle.
 STATED_STD, HEADING_STD = np.deg2rad(10.0), np.pi / np.sqrt(3.0)
-
 MOST_LAYOUTS = 4  # that are remembered
 _layouts: dict[tuple[Any, ...], Layout] = {}
 
 
 def find_layout(protocol: Protocol, model: BodyModel, recording: Recording) -> Layout:
-    """Return the layout of a protocol on a body, an earlier one where it is the same: its functions take 60 ms."""
+    """Return the layout of a protocol on a body, an earlier one if it is the same: its functions take long to build."""
     joints, sensors = tuple(recording.joints.items()), tuple(recording.sensors)
     key = id(model), protocol, recording.start_pose, joints, sensors  # a layout keeps its model alive
     layout = _layouts.get(key) or Layout(protocol, model, recording)

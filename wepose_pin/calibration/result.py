@@ -66,7 +66,7 @@ ENOUGH_SAMPLES = 12.0
 
 
 class Check(NamedTuple):
-    """One number against its limits, from which on it passes, or is poor, where `passes` is the larger one."""
+    """One number against its limits, which are lower ones where `passes` is the larger of them."""
 
     diagnostic: Diagnostic  # what is checked: its value, and `passes` as limit
     quality: Quality
