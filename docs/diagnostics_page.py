@@ -48,11 +48,11 @@ def document() -> str:
         for code, table in tables.items():
             lines.append(f"### {code}\n")
             base = render(examples[code, ""])
-            lines.append(f"{base.what}\n**{base.do}**\n")
+            lines.append(f"{base['what']}\n**{base['do']}**\n")
             for variant, changed in table.get("variants", {}).items():
                 if {"what", "why"} <= set(changed):
                     text = render(examples[code, variant])
-                    lines.append(f"{text.what}\n" + (f"**{text.do}**\n" if text.do != base.do else ""))
+                    lines.append(f"{text['what']}\n" + (f"**{text['do']}**\n" if text["do"] != base["do"] else ""))
     return "\n".join(lines)
 
 

@@ -14,7 +14,7 @@ import pytest
 import wepose_pin
 from docs.diagnostics_page import document, list_examples
 from wepose_pin import Diagnostic
-from wepose_pin.diagnostics import ERROR, WARNING, as_json, from_json, render, render_all
+from wepose_pin.diagnostics import ERROR, WARNING, as_json, from_json, join_text, render, render_all
 
 PACKAGE = Path(wepose_pin.__file__).parent
 # Functions that make a diagnostic of the code that is their first argument, beside `Diagnostic` itself.
@@ -82,12 +82,12 @@ def test_facts_of_each_call_are_those_of_its_text() -> None:
 def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, variant: str) -> None:
     example = EXAMPLES[code, variant]
     text = render(example)
-    assert text.title
+    assert text["title"]
     for part in text[1:]:
         assert part.endswith((".", "!")), part
         assert "  " not in part
         assert "{" not in part.replace("{ up", "")
-    assert text.line().startswith(text.what)
+    assert join_text(text).startswith(text["what"])
     table = CATALOGUE[code]
     variants = table.get("variants", {})
     tables = [table, *variants.values()]
@@ -146,10 +146,10 @@ def test_alike_are_told_together_the_gravest_first() -> None:
     slow = Diagnostic("start-pose-late", "info", value=12.0)
     resets = Diagnostic("heading-resets-not-repeated", "info", "live.mcap", 2)
     texts = render_all([resets, *lost, lost[0], dead, slow])
-    titles = [text.title for _, text in texts]
+    titles = [text["title"] for _, text in texts]
     assert titles[:2] == ["Samples lost", "Sensor frozen"]
     assert titles[2] == "Live heading resets not repeated"
     assert texts[0][0] == WARNING
-    assert texts[0][1].what.count("lost") == 3
-    assert texts[0][1].what.endswith("The same holds for d, e.")
-    assert texts[0][1].line(titled=True).startswith("**Samples lost.** The a sensor lost 2 % of its samples")
+    assert texts[0][1]["what"].count("lost") == 3
+    assert texts[0][1]["what"].endswith("The same holds for d, e.")
+    assert join_text(texts[0][1], titled=True).startswith("**Samples lost.** The a sensor lost 2 % of its samples")

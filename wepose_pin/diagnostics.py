@@ -16,7 +16,7 @@ from functools import lru_cache
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 
 class Severity(StrEnum):
@@ -45,54 +45,49 @@ class Diagnostic:
 
     def __str__(self) -> str:
         """The severity and the text, in one line."""
-        return f"{self.severity.value}: {render(self).line()}"
+        return f"{self.severity.value}: {join_text(render(self))}"
 
 
-class Text(NamedTuple):
-    """A diagnostic in words; each part is one or more sentences."""
+def render(diagnostic: Diagnostic) -> dict[str, str]:
+    """Put the diagnostic in words: its ``title``, ``what`` is wrong, ``why`` it matters, and what to ``do``.
 
-    title: str
-    what: str  # what is wrong, with value and limit
-    why: str  # why it matters
-    do: str  # what to do
-
-    def line(self, titled: bool = False) -> str:
-        """All parts in one line; `titled`: with the title before them, in bold."""
-        title = f"**{self.title}.**" if titled else ""
-        return " ".join(part for part in (title, self.what, self.why, self.do) if part)
-
-
-def render(diagnostic: Diagnostic) -> Text:
-    """Put the diagnostic in words; `KeyError`: the catalogue has no such code, or a fact of its text is missing."""
+    Each part is one or more sentences. `KeyError`: the catalogue has no such code, or a fact of its text is missing.
+    """
     template = catalogue()[diagnostic.code]
     for word in str(diagnostic.facts.get("variant", "")).split():
         template = {**template, **template.get("variants", {}).get(word, {})}
     known = {"place": diagnostic.place, "value": diagnostic.value, "limit": diagnostic.limit, **diagnostic.facts}
-    return Text(*(_fill(template[part], known) for part in Text._fields))
+    return {part: _fill(template[part], known) for part in ("title", "what", "why", "do")}
+
+
+def join_text(text: Mapping[str, str], titled: bool = False) -> str:
+    """Join the parts of `render` in one line; `titled`: with the title before them, in bold."""
+    title = f"**{text['title']}.**" if titled else ""
+    return " ".join(part for part in (title, text["what"], text["why"], text["do"]) if part)
 
 
 def render_all(
     diagnostics: Iterable[Diagnostic], remedies: Mapping[str, str] = MappingProxyType({})
-) -> list[tuple[Severity, Text]]:
+) -> list[tuple[Severity, dict[str, str]]]:
     """Put diagnostics in words, the gravest first, alike ones as one; `remedies`: code → another thing to do."""
-    alike: dict[tuple[str, Severity, Text], dict[str, str]] = {}  # code, severity, text without `what` → `what` → place
+    alike: dict[Any, tuple[Severity, dict[str, str], dict[str, str]]] = {}  # severity, the first text, `what` → place
     for diagnostic in gravest_first(diagnostics):
         text = render(diagnostic)
-        text = text._replace(do=remedies.get(diagnostic.code, text.do))
-        key = text._replace(what="") if text.do else text
-        alike.setdefault((diagnostic.code, diagnostic.severity, key), {}).setdefault(text.what, diagnostic.place)
+        text["do"] = remedies.get(diagnostic.code, text["do"])
+        key = (diagnostic.code, diagnostic.severity, *(text[part] for part in text if part != "what" or not text["do"]))
+        alike.setdefault(key, (diagnostic.severity, text, {}))[2].setdefault(text["what"], diagnostic.place)
     texts = []
-    for (_, severity, text), places in alike.items():
+    for severity, text, places in alike.values():
         shown, others = list(places)[:MOST_ALIKE], list(places.values())[MOST_ALIKE:]
         if others:
             shown.append(f"The same holds for {', '.join(dict.fromkeys(others)).replace('_', ' ')}.")
-        texts.append((severity, text._replace(what=" ".join(shown))))
+        texts.append((severity, text | {"what": " ".join(shown)}))
     return texts
 
 
 def lines(diagnostics: Iterable[Diagnostic], titled: bool = False) -> list[tuple[Severity, str]]:
     """`render_all`, each in one line."""
-    return [(severity, text.line(titled)) for severity, text in render_all(diagnostics)]
+    return [(severity, join_text(text, titled)) for severity, text in render_all(diagnostics)]
 
 
 def notebook_html(value: object, diagnostics: Iterable[Diagnostic] = (), tables: Iterable[str] = ()) -> str:
@@ -127,7 +122,7 @@ def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
 
     facts = {name: convert(fact) for name, fact in diagnostic.facts.items()}
     own = {name: convert(getattr(diagnostic, name)) for name in ("code", "severity", "place", "value", "limit")}
-    return own | {"facts": facts, "text": render(diagnostic)._asdict()}
+    return own | {"facts": facts, "text": render(diagnostic)}
 
 
 def from_json(content: Mapping[str, Any]) -> Diagnostic:

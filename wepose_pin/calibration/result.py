@@ -169,7 +169,7 @@ class Calibration:
         stds = [1e3 * std for name in self.subject.lengths if np.isfinite(std := self.subject.std(name))]
         lengths = f"{len(self.subject.lengths)} lengths"
         lengths += f" ± {min(stds):.0f} to {max(stds):.0f} mm" if stds else ""
-        remedy = f"; first: {render(self.quality.reasons[0]).do}" if self.quality.reasons else ""
+        remedy = f"; first: {render(self.quality.reasons[0])['do']}" if self.quality.reasons else ""
         return f"Calibration({self.subject.name!r}: {self.quality.quality}; {lengths}{remedy})"
 
     def _repr_html_(self) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import check_arguments, check_value
-from ..diagnostics import WARNING, Diagnostic, render
+from ..diagnostics import WARNING, Diagnostic, join_text, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
 from ..recording.faults import find_faults, find_gyro_range
@@ -140,7 +140,7 @@ def estimate_orientation(
         facts = {"method": method} | ({"variant": "estimated"} if method in ("amekf", "smoother") else {})
         missing = Diagnostic("static-phase-missing", WARNING, facts=facts)
         diagnostics = (missing,)
-        warnings.warn(render(missing).line(), WeposeWarning, stacklevel=2)
+        warnings.warn(join_text(render(missing)), WeposeWarning, stacklevel=2)
     else:
         first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
         if not 0 <= first < last <= len(gyro) + 1:

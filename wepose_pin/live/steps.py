@@ -15,7 +15,7 @@ from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.result import format_longest
-from ..diagnostics import render, render_all
+from ..diagnostics import join_text, render, render_all
 from ..errors import BadData, WeposeError
 from ..recording import check_recording
 from ..recording.arrivals import unpack_orientations
@@ -280,7 +280,7 @@ def _add_estimate(view: GuideView, calibration: Calibration, running: bool) -> G
     # About the parts of the motion that are too small, else the worst reason.
     reasons = [reason for reason in calibration.quality.reasons if not reason.code.startswith("scale-")]
     reasons = [reason for reason in reasons if reason.code.startswith("motion-")] or reasons[:1]
-    advice = dict.fromkeys(REMEDIES.get(reason.code, render(reason).do) for reason in reasons)
+    advice = dict.fromkeys(REMEDIES.get(reason.code, render(reason)["do"]) for reason in reasons)
     return view._replace(reasons=tuple(advice)[:MOST_ADVICE])
 
 
@@ -341,7 +341,7 @@ def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> t
     begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
     open_s = format_longest([(first - begin, last - begin) for first, last in calibration.open_intervals])
     counted = [replace(d, facts={**d.facts, "intervals": open_s}) if "intervals" in d.facts else d for d in diagnostics]
-    reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
+    reasons = [join_text(text) for _, text in render_all(counted, REMEDIES)]
     codes, actions = [reason.code for reason in quality.reasons], [ACCEPT, MORE, RESTART]
     if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned."
