@@ -82,8 +82,9 @@ def test_facts_of_each_call_are_those_of_its_text() -> None:
 def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, variant: str) -> None:
     example = EXAMPLES[code, variant]
     text = render(example)
-    assert text["title"]
-    for part in text[1:]:
+    title, *sentences = text.values()
+    assert title
+    for part in sentences:
         assert part.endswith((".", "!")), part
         assert "  " not in part
         assert "{" not in part.replace("{ up", "")
