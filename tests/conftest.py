@@ -52,8 +52,8 @@ def person() -> Person:
 
 @pytest.fixture(scope="session")
 def simulation(person: Person) -> Simulation:
-    """Two minutes of clasp and circles with the noise of an MTi-3."""
-    return simulate(person.lengths, seed=3)
+    """A clasp of 40 s and four circles, with the noise of an MTi-3."""
+    return simulate(person.lengths, seed=3, clasp_s=40.0, circles=4)
 
 
 @pytest.fixture(scope="session")

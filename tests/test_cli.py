@@ -105,7 +105,7 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
     assert "Quality: pass" in printed
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
     assert "amekf, lengths: hands together" in capsys.readouterr().out
-    assert run("evaluate", tmp_path / "result", tmp_path / "truth.parquet", "--interval", 72, 100) == 0
+    assert run("evaluate", tmp_path / "result", tmp_path / "truth.parquet", "--interval", 53, 80) == 0
     assert "right_forearm" in capsys.readouterr().out
     assert run("view", tmp_path / "result", "-o", tmp_path / "page.html", "--no-open") == 0
     assert (tmp_path / "page.html").read_text().startswith("<!")

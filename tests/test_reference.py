@@ -19,7 +19,7 @@ from test_info import info
 from wepose_pin import Pose, Simulation, TrackResult, WeposeError, evaluate, load_model, population_subject, track
 from wepose_pin.evaluation import register
 from wepose_pin.readers.reference import read_reference
-from wepose_pin.simulation import Person
+from wepose_pin.simulation import Person, simulate
 
 # The laboratory: y is up, turned by 70 deg, its origin somewhere, its clock late.
 R_VW = Rotation.from_euler("x", -90, degrees=True) * Rotation.from_euler("z", -70, degrees=True)
@@ -27,6 +27,11 @@ PLACE_V = np.array([1.2, 0.93, -0.4])
 LATE_S = 3.217
 LAB_HZ = 60.0
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
+
+
+@pytest.fixture(scope="module")
+def simulation(person: Person) -> Simulation:
+    return simulate(person.lengths, seed=3)
 
 
 @pytest.fixture(scope="module")
