@@ -83,14 +83,9 @@ def _split(hint: Any) -> tuple[tuple[Any, Range | None], ...]:
     return ((hint, None),)
 
 
-def _find_kind(hint: Any) -> Any:
-    """Return the class of the values that an annotation takes; `tuple` of every list."""
-    origin = get_origin(hint) or hint
-    return str if origin is Literal else tuple if origin is Sequence else _KINDS.get(origin, (origin,))[0]
-
-
 def _takes(hint: Any, value: Any) -> bool:
-    kind = _find_kind(hint)
+    origin = get_origin(hint) or hint
+    kind = str if origin is Literal else tuple if origin is Sequence else _KINDS.get(origin, (origin,))[0]
     is_no_number = kind in (Real, Integral) and (isinstance(value, bool) or value != value)
     return isinstance(value, tuple | list if kind is tuple else kind) and not is_no_number
 
@@ -124,9 +119,9 @@ def check_arguments(function: Any, arguments: Mapping[str, Any]) -> None:
             check_value(name, arguments[name], hint)
 
 
-def check_fields(value: Any, place: str, kind: type | None = None) -> None:
-    """Check every field of a dataclass against its annotation, or those of its base class `kind`."""
-    for name, hint in _read_hints(kind or type(value)).items():
+def check_fields(value: Any, place: str) -> None:
+    """Check every field of a dataclass against its annotation."""
+    for name, hint in _read_hints(value.__class__).items():
         check_value(f"{place}{name}", getattr(value, name), hint)
 
 

@@ -189,10 +189,6 @@ class Key:
     unread: tuple[str, ...] = ()  # keys beside those, for whoever looks at the file
     digits: int | None = None  # decimals that are written; None: all that count
 
-    @property
-    def limits(self) -> Range:
-        return Range(self.least, closed=True, high=self.most, unit=self.unit.replace("_", "/"))
-
 
 @cache
 def _find_keys(kind: Callable[..., Any]) -> dict[str, tuple[Any, Key]]:
@@ -255,7 +251,8 @@ def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Colle
         keys = (replace(key, name=part, each=(), least=least[part]) for part in key.each)
         return np.array([_read_value(float, table, each, {}, None) for each in keys])
     names: Collection[str] = known[key.of] if key.of else key.words
-    hint = str if key.words else Annotated[hint, key.limits] if float in (hint, *parts) else hint
+    limits = Range(key.least, closed=True, high=key.most, unit=key.unit.replace("_", "/"))
+    hint = str if key.words else Annotated[hint, limits] if float in (hint, *parts) else hint
     if value is None:
         needed = one_of(names) if names else f"{describe(hint)} is needed"
         raise table.error(f"{table.at(key.name)} is missing; {needed}")

@@ -62,7 +62,7 @@ class Pose:
     def check(self) -> Pose:
         """Check all fields and return the pose; NaN stands for missing values. Raise `BadOption` or `BadData`."""
         where, n = "pose: ", np.size(self.time)
-        check_fields(self, where, Pose)
+        check_fields(self, where)
         check_array(f"{where}time", self.time, (n,))
         if not n:
             raise BadData(f"{where}time has no samples")

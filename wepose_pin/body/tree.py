@@ -185,21 +185,19 @@ def _neutral_orientation(
 
 def _add_links(robot: Any, added: Mapping[str, tuple[str, np.ndarray]]) -> Any:
     """Fix massless links to those of the robot, ``root`` above its own; a link that has such a name gets ``_link``."""
-    yourdfpy = import_yourdfpy()
-    own = {link.name for link in robot.links}
+    library, own = import_yourdfpy(), {link.name for link in robot.links}
     renamed = {name: f"{name}_link" for name in added if name in own}
     for link in robot.links:
         link.name = renamed.get(link.name, link.name)
     for joint in robot.joints:
-        joint.parent = renamed.get(joint.parent, joint.parent)
-        joint.child = renamed.get(joint.child, joint.child)
+        joint.parent, joint.child = (renamed.get(end, end) for end in (joint.parent, joint.child))
     joints = {joint.name for joint in robot.joints}
     for name, (link, M) in added.items():
         ends, joint_name = (renamed.get(link, link), name), f"{name}_fixed"
         while joint_name in joints:
             joint_name += "_"
-        robot.links.append(yourdfpy.Link(name=name))
-        robot.joints.append(yourdfpy.Joint(joint_name, "fixed", *(ends[::-1] if name == "root" else ends), origin=M))
+        robot.links.append(library.Link(name=name))
+        robot.joints.append(library.Joint(joint_name, "fixed", *(ends[::-1] if name == "root" else ends), origin=M))
     return robot
 
 
