@@ -71,7 +71,7 @@ def encoded(name: str) -> bytes:
 
 MANY = "9" * 400
 SECRET = b'<!DOCTYPE robot [<!ENTITY a SYSTEM "file:///etc/hostname">]><robot name="&a;"/>'
-STANDS = "PacketCounter,SampleTimeFine,dq_W,dq_X,dq_Y,dq_Z,dv[1],dv[2],dv[3]\n" + "1,5,1,0,0,0,0,0,0.098\n" * 3
+STANDS = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n" + "1,5,0,0,9.81,0,0,0\n" * 3
 # The target, its input, and what the line says.
 REFUSED: list[tuple[str, Callable[[], bytes], str]] = [
     (
@@ -89,8 +89,8 @@ REFUSED: list[tuple[str, Callable[[], bytes], str]] = [
         ("protocol", lambda text=text: change_direction(text), "three numbers are needed")
         for text in ("0, 0, 0", "1e308, 0, 0", "nan, 0, 0")
     ),
-    ("dot", lambda: change("dot", ",1,0,0,0,", ",1,1e308,0,0,", 1), "no device measures as much"),
-    ("dot", STANDS.encode, "its time does not grow"),
+    ("dot", STANDS.replace("9.81", "1e308", 1).encode, "no device measures as much"),
+    ("dot", STANDS.encode, "time stands still in row 2"),
     *(
         (
             "mt_manager",
