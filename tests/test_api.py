@@ -233,7 +233,7 @@ def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, 
     )
     np.testing.assert_allclose(moved.joint_position, read.joint_position, atol=1e-6)
     assert repr(moved) == repr(read)
-    assert (moved.robot.margins.speed_scale, moved.robot.margins.limit_margin) == (0.5, 0.1)
+    assert (moved.robot.speed_scale, moved.robot.limit_margin) == (0.5, 0.1)
     assert moved.params.orientation == 0.0
     assert moved.recorded_time[[0, -1]] == pytest.approx([10.0, 16.0], abs=0.02)
     with pytest.raises(wp.WeposeError, match="a Robot has arms and margins of its own"):
