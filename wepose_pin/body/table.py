@@ -104,17 +104,40 @@ class Length(NamedTuple):
 
 
 class HingeJoint(NamedTuple):
-    """A joint of nearly one axis; standard deviations [rad]."""
+    """A joint of nearly one axis; unit vectors (3,), standard deviations [rad].
+
+    Vectors are in the segments' frames L; of hinges between sensors, as `find_hinges` finds them, in L'.
+    """
 
     on: SegmentName
     moves: SegmentName  # its long axis stays in the plane of `on` that is normal to the axis
-    axis: Vector  # unit, in the frame of `on`
-    range: Annotated[tuple[float, float], Key(unit="deg")] = (-np.pi, np.pi)  # [rad] of `moves` about the axis
+    axis: Vector  # in the frame of `on`
+    # [rad] of the angle about the axis from the long axis of `on` to that of `moves`
+    range: Annotated[tuple[float, float], Key(unit="deg")] = (-np.pi, np.pi)
     softness: Angle = float(np.deg2rad(2.0))  # of the angle between the long axis and the plane
     # Of the axis's rotation about the long axis of `on`: the part that is equal, and opposite, on both sides.
     common_std: Angle = float(np.deg2rad(6.5))
     mirror_std: Angle = float(np.deg2rad(20.0))
     tilt_std: Angle = float(np.deg2rad(5.0))  # of the axis's rotation about the direction across both
+    # Of hinges between sensors:
+    name: Annotated[str, None] = ""  # of the joint
+    along_on: Annotated[Vector, None] = ZERO  # the long axis of `on`
+    along: Annotated[Vector, None] = ZERO  # the long axis of `moves`, in its own frame
+
+    @property
+    def across(self) -> np.ndarray:
+        """(3,) by which the axis changes as it turns about the long axis of `on`."""
+        return np.cross(self.along_on, self.axis)
+
+    @property
+    def tilted(self) -> np.ndarray:
+        """(3,) by which the axis changes as it turns about the direction across both."""
+        return -np.array(self.along_on)
+
+    @property
+    def side(self) -> np.ndarray:
+        """(3,) the direction to which `moves` bends."""
+        return np.asarray(-np.sign(sum(self.range)) * self.across)
 
 
 class Drawing(NamedTuple):

@@ -41,6 +41,7 @@ from ..observations.expressions import (
     ZERO_LENGTH,
     about_z,
     express_covariance,
+    express_deviation,
     find_girdles,
     find_hinges,
     product,
@@ -180,7 +181,7 @@ def _express_residuals(layout: Layout, condition: Condition) -> tuple[ca.Functio
     if isinstance(condition, Closure | FreeMotion):
         for i, hinge in enumerate(layout.hinges):
             error = x[layout.hinge[i]]
-            hinges[i] = hinge.deviation(quat_WL[hinge.on], quat_WL[hinge.moves], error) / HINGE_STD
+            hinges[i] = express_deviation(hinge, quat_WL[hinge.on], quat_WL[hinge.moves], error) / HINGE_STD
     r = ca.cse(ca.vertcat(r, hinges))
     jacobian = ca.cse(ca.densify(ca.jacobian(r, x)).T)
     return ca.Function("residuals", [x, data], [r, ca.densify(gap)]), ca.Function("jacobian", [x, data], [jacobian])

@@ -268,7 +268,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
         scale = f"measured: {', '.join(problem.scale_lengths)}"
     elif layout.scale_observed:
         scale = "of the closure"
-    hinges, hinge_rms = _estimate_hinges(problem, fit, x_cov)
+    hinges, hinge_rms = _estimate_hinges(fit, x_cov)
     scatter = estimate_scatter([hinge.std for hinge in hinges.values()])
     subject = _make_subject(problem, fit, x_cov, scatter)
     subject = replace(subject, hinges=hinges, note=f"{problem.protocol.title}; scale {scale}")
@@ -332,9 +332,7 @@ def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndar
     )
 
 
-def _estimate_hinges(
-    problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray
-) -> tuple[dict[str, Hinge], dict[str, float]]:
+def _estimate_hinges(fit: LeastSquares, x_cov: np.ndarray) -> tuple[dict[str, Hinge], dict[str, float]]:
     """Return joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
     layout, hinges, hinge_rms = fit.layout, {}, {}
     spans = [span for c, span in fit.spans if isinstance(c, Closure | FreeMotion)]
@@ -345,11 +343,11 @@ def _estimate_hinges(
     }
     for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
         if spans:
-            axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
+            axis = np.array(term.axis) + across * term.across + tilted * term.tilted
             axis_L = layout.start_pose.rotation(term.on).T @ axis / np.linalg.norm(axis)
             bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
             hinge_rms[term.name] = rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
-            std = max(rms, problem.model.table.hinges[term.name].softness)
+            std = max(rms, term.softness)
             hinges[term.name] = Hinge(axis_L, std, lags.get(term.on))
     return hinges, hinge_rms
 

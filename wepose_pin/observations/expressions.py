@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,7 +21,7 @@ from ..body import BodyModel
 from ..body.girdle import PARAMETERS, make_law
 from ..body.links import find_carrier
 from ..body.mounts import StartPose
-from ..body.table import Vector
+from ..body.table import HingeJoint
 from ..body.tree import UNIVERSE
 from ..errors import BadSession
 from ..rotations import product_terms
@@ -243,44 +243,18 @@ def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: 
 # Hinges ---------------------------------------------------------------------------------------------------------------
 
 
-class HingePlane(NamedTuple):
-    """A hinge between two segments with sensors, the segments `on` above and `moves` below; unit vectors (3,) in L'."""
+def express_deviation(hinge: HingeJoint, quat_on: ca.SX, quat_moves: ca.SX, error: ca.SX) -> ca.SX:
+    """Return the sine of the angle by which `moves` leaves the hinge's plane; the axis is off by `error` (2,) [rad].
 
-    name: str  # of the joint
-    on: str
-    moves: str
-    axis: Vector  # in the frame of `on`
-    along_on: Vector  # the long axis of `on`
-    along: Vector  # the long axis of `moves`, in its own frame
-    range: tuple[float, float]  # [rad] of the angle about the axis from the long axis of `on` to that of `moves`
-
-    @property
-    def across(self) -> np.ndarray:
-        """(3,) by which the axis changes as it turns about the long axis of `on`."""
-        return np.cross(self.along_on, self.axis)
-
-    @property
-    def tilted(self) -> np.ndarray:
-        """(3,) by which the axis changes as it turns about the direction across both."""
-        return -np.array(self.along_on)
-
-    @property
-    def side(self) -> np.ndarray:
-        """(3,) the direction to which `moves` bends."""
-        return np.asarray(-np.sign(sum(self.range)) * self.across)
-
-    def deviation(self, quat_on: ca.SX, quat_moves: ca.SX, error: ca.SX) -> ca.SX:
-        """Return the sine of the angle by which `moves` leaves the plane; the axis is off by `error` (2,) [rad].
-
-        The error is along `across` and `tilted`.
-        """
-        along = rotate_back(quat_on, rotate(quat_moves, self.along))
-        axis = ca.DM(self.axis) + ca.horzcat(ca.DM(self.across), ca.DM(self.tilted)) @ error
-        return ca.dot(axis, along) / ca.norm_2(axis)
+    The error is along `across` and `tilted`.
+    """
+    along = rotate_back(quat_on, rotate(quat_moves, hinge.along))
+    axis = ca.DM(hinge.axis) + ca.horzcat(ca.DM(hinge.across), ca.DM(hinge.tilted)) @ error
+    return ca.dot(axis, along) / ca.norm_2(axis)
 
 
 def linearize_hinge(
-    hinge: HingePlane, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray
+    hinge: HingeJoint, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Linearize a hinge of orientations (n, 4) at heading errors (2,) [rad] of `moves` and `on`.
 
@@ -296,12 +270,12 @@ def linearize_hinge(
 
 
 @lru_cache(maxsize=128)
-def _linearization(hinge: HingePlane) -> ca.Function:
+def _linearization(hinge: HingeJoint) -> ca.Function:
     """Return the rows of a sample as a function of both quaternions and both headings."""
     on, moves = ca.SX.sym("on", 4), ca.SX.sym("moves", 4)
     headings, error = ca.SX.sym("headings", 2), ca.SX.sym("error", 2)
     quat_on, quat_moves = product(about_z(headings[1]), on), product(about_z(headings[0]), moves)
-    r = hinge.deviation(quat_on, quat_moves, error)
+    r = express_deviation(hinge, quat_on, quat_moves, error)
     H = ca.jacobian(r, ca.vertcat(headings, error))
     r, H = ca.substitute([r, H], [error], [ca.DM.zeros(2)])
     along = rotate_back(quat_on, rotate(quat_moves, hinge.along))
@@ -317,17 +291,15 @@ def _linearization(hinge: HingePlane) -> ca.Function:
     return ca.Function("hinge", [on, moves, headings], rows, {"cse": True})
 
 
-def find_hinges(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[HingePlane, ...]:
-    """Find the hinges of the body whose two segments both have sensors, with the axes of its table."""
+def find_hinges(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[HingeJoint, ...]:
+    """Find the hinges of the body whose two segments both have sensors, with the axes of its table in L'."""
+    segments = model.table.segments
     return tuple(
-        HingePlane(
-            name,
-            hinge.on,
-            hinge.moves,
-            start.turn(hinge.on, hinge.axis),
-            start.turn(hinge.on, model.table.segments[hinge.on].along),
-            start.turn(hinge.moves, model.table.segments[hinge.moves].along),
-            hinge.range,
+        hinge._replace(
+            name=name,
+            axis=start.turn(hinge.on, hinge.axis),
+            along_on=start.turn(hinge.on, segments[hinge.on].along),
+            along=start.turn(hinge.moves, segments[hinge.moves].along),
         )
         for name, hinge in model.table.hinges.items()
         if {hinge.on, hinge.moves} <= set(sensors)

@@ -32,10 +32,11 @@ from ..body.mounts import (
     find_mount_covariance,
 )
 from ..body.subject import Subject
+from ..body.table import HingeJoint
 from ..calibration import load_protocol
 from ..errors import BadSession
 from ..filters.noise import SensorNoise
-from ..observations.expressions import HingePlane, PointPath, find_hinges, linearize_hinge
+from ..observations.expressions import PointPath, find_hinges, linearize_hinge
 from ..observations.joint_accelerations import LEAST_RATE_HZ, find_joint_pairs, linearize_joint
 from ..recording import Recording
 
@@ -439,7 +440,7 @@ def _split_misfit(misfit: np.ndarray, correlated_samples: float) -> tuple[float,
 
 def _find_hinges(
     first: Recording, names: tuple[str, ...], subject: Subject, model: BodyModel, hinge_std: float
-) -> tuple[tuple[HingePlane, ...], np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[tuple[HingeJoint, ...], np.ndarray, np.ndarray, np.ndarray]:
     """Find the h hinges between two sensors, and standard deviations (h,) [rad] of three errors.
 
     They are of the axis about the long axis of the segment above and across, and of the angle between the hinge's plane
@@ -448,14 +449,13 @@ def _find_hinges(
     # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
     start, calibrated = StartPose(model.neutral_rotations), {} if first.remounted else subject.hinges
     hinges, stds = [], []
-    for plane in find_hinges(model, start, names):
-        hinge = model.table.hinges[plane.name]
-        if plane.name in calibrated:
-            axis, std = start.turn(plane.on, calibrated[plane.name].axis), calibrated[plane.name].std
-            hinges.append(plane._replace(axis=axis))
-            stds.append((AXIS_STD, TILT_STD, max(std, hinge_std)))
+    for hinge in find_hinges(model, start, names):
+        if hinge.name in calibrated:
+            own = calibrated[hinge.name]
+            hinges.append(hinge._replace(axis=start.turn(hinge.on, own.axis)))
+            stds.append((AXIS_STD, TILT_STD, max(own.std, hinge_std)))
         elif not model.table.is_mechanism:
-            hinges.append(plane)
+            hinges.append(hinge)
             axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
             stds.append((axis_std, hinge.tilt_std, max(hinge.softness, hinge_std)))
     axis_stds, tilt_stds, plane_stds = np.array(stds).reshape(-1, 3).T
