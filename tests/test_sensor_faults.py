@@ -85,6 +85,13 @@ def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, ma
     assert all(sensor.gap is None for name, sensor in read.sensors.items() if name != BROKEN)
 
 
+def test_a_dead_accelerometer_of_arrays_is_refused_by_name(made: Simulation) -> None:
+    recording = made.recording()
+    dead = with_sensor(recording, BROKEN, accel_S=np.zeros((len(recording), 3)))
+    with pytest.raises(WeposeError, match=f"sensors.{BROKEN}: the static phase holds no gravity"):
+        track(replace(dead, phases={}))
+
+
 @pytest.mark.parametrize(
     ("since", "until", "method"), [(9.0, 99.0, "amekf"), (9.0, 99.0, "smekf"), (5.0, 7.4, "smoother")]
 )

@@ -123,6 +123,8 @@ def calibrate(
         The recording lacks a sensor or a phase that the protocol needs.
     BadModel
         The table of the body names no lengths.
+    BadSubject, NoSolution
+        The prior has no positive definite covariance of its lengths; the lengths do not converge.
 
     Examples
     --------

@@ -41,9 +41,7 @@ class SensorNoise:
     gyro_bias_cov: np.ndarray  # (3, 3) [rad²/s²] of that mean, slow motion in the phase included (a person sways)
     gyro_cov: np.ndarray  # (3, 3) Σ̂_ω, sample covariance of gyro [rad²/s²]
     accel_cov: np.ndarray  # (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
-    bias_step_cov: (
-        np.ndarray
-    )  # (3, 3) Σ_b, covariance of gyro's first differences [rad²/s²], as in the authors' software
+    bias_step_cov: np.ndarray  # (3, 3) [rad²/s²] Σ_b, that of gyro's first differences, as in the authors' software
     gravity: float  # mean norm of accel [m/s²]: the gravity scale
     # (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; None: white noise
     gyro_half_second_cov: np.ndarray | None = None

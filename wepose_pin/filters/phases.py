@@ -216,7 +216,8 @@ def find_static_window(recording: Recording) -> tuple[float, float]:
         motion += rates.var(axis=-1).sum(axis=-1)
         if isinstance(sensor, ImuSensor):
             up = slide(sensor.accel_S).mean(axis=-1)
-            vertical_rates.append(np.einsum("ni,ni->n", rates.mean(axis=-1), up) / np.linalg.norm(up, axis=1))
+            force = np.maximum(np.linalg.norm(up, axis=1), 1e-9)  # of a dead accelerometer zero
+            vertical_rates.append(np.einsum("ni,ni->n", rates.mean(axis=-1), up) / force)
         if sensor.gap is not None:  # a bridge has no motion
             motion[slide(sensor.gap).any(axis=-1)] = np.inf
     if vertical_rates:
