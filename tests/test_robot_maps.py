@@ -103,9 +103,12 @@ def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
     with pytest.raises(errors.WeposeError, match="torso, right_shoulder"):
         retargeting.retarget(without("torso"), arm)
     with pytest.raises(
-        errors.WeposeError, match=r"right arm follows right_.*; an arm needs sensors on torso, upper arm and forearm"
+        errors.WeposeError, match=r"right arm follows right_.*; an arm needs sensors on torso, upper arm and forearm$"
     ):
         retargeting.retarget(person(2.0, side="left"), arm)
+    has_both = arm.map._replace(arms={**arm.map.arms, "left": arm.map.arms["right"]})  # of which one was selected
+    with pytest.raises(errors.WeposeError, match=r"arm's right arm follows right_[^;]*;.* or choose arm left$"):
+        retargeting.retarget(person(2.0, side="left"), replace(arm, map=has_both))
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ def say(text: str) -> None:
 
 
 def say_paragraph(text: str, indent: str = "") -> None:
-    """Running text on standard output."""
-    say(textwrap.fill(text, WIDTH, initial_indent=indent, subsequent_indent=indent * 2))
+    """Running text, as reports have it, on standard output."""
+    say(textwrap.fill(text.replace("**", ""), WIDTH, initial_indent=indent, subsequent_indent=indent * 2))
 
 
 def print_diagnostics(diagnostics: Iterable[Diagnostic]) -> None:

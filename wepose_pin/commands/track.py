@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from ..diagnostics import from_json
 from .options import MORE, RESEARCH, Force, Method, Model, Out, Subject, described_by
-from .output import print_diagnostics, progress_bar, say, say_pages
+from .output import print_diagnostics, progress_bar, say, say_pages, say_paragraph
 
 
 @described_by("tracking/__init__.py:track", "readers/__init__.py:load_session")
@@ -104,10 +104,14 @@ def track(
             write_about(folder, summary.last, summary, joint_torques, provenance)
         progress("making the pages", 2 / 3)
         failures = write_track_pages(out, summary, view=view, report=report)
+        from ..report.track import describe_reliance  # with it comes matplotlib
+
+        reliance = describe_reliance(summary.tracked)
     content = summary.content
     print_diagnostics(from_json(each) for each in content["diagnostics"])
     lengths = content["subject"]["note"] or content["subject"]["name"]
     say("{recording}: {duration_s:g} s at {rate_hz:g} Hz, {method}, lengths: ".format(**content) + lengths)
+    say_paragraph(reliance)
     print_diagnostics(failures)
     say_pages(out)
     say(f"Pose: {out / 'pose.parquet'}  ({len(content['sensors'])} segments, {len(content['points'])} points)")

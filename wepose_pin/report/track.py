@@ -54,9 +54,7 @@ def render_track_report(summary: TrackSummary) -> str:
     """
     tracked, measures = summary.tracked, summary
     recording, table = tracked.recording, tracked.model.table
-    angles = None
-    with contextlib.suppress(BadData):  # no joint has both of its segments
-        angles = joint_angles(tracked.pose, AUTO)
+    angles = _compute_angles(tracked)
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
     page = pose_html(
         tracked.model,
@@ -68,7 +66,7 @@ def render_track_report(summary: TrackSummary) -> str:
     return render_page(
         f"Motion of {recording.name or 'a recording'}",
         [
-            _describe_reliance(tracked, angles),
+            describe_reliance(tracked),
             show_diagnostics(summary.diagnostics, f"**No warnings.** {checked} are within their limits."),
             _describe_recording(tracked),
         ],
@@ -85,9 +83,15 @@ def render_track_report(summary: TrackSummary) -> str:
 # Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
+def _compute_angles(tracked: TrackResult) -> Angles | None:
+    with contextlib.suppress(BadData):  # no joint has both of its segments
+        return joint_angles(tracked.pose, AUTO)
+    return None
+
+
+def describe_reliance(tracked: TrackResult) -> str:
     """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
-    after_start, table = find_samples_after_start(tracked), tracked.model.table
+    after_start, table, angles = find_samples_after_start(tracked), tracked.model.table, _compute_angles(tracked)
     stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
     for joint, each in angles.joints.items() if angles is not None else ():
         for k, angle in enumerate(each.names):
@@ -116,7 +120,7 @@ def _describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
 def _explain_no_covariance(tracked: TrackResult) -> str:
     source = f"The filter {tracked.options['method']}" if tracked.recording.imus else "The device"
     return (
-        f"{source} states no uncertainty, so this page cannot say how far angles and positions may be off. The methods "
+        f"{source} states no uncertainty: how far angles and positions may be off is not known. The methods "
         "amekf, smoother, smekf and smekf_published state it."
     )
 
@@ -268,8 +272,8 @@ def draw_figures(result: TrackResult) -> Figures:
     figures, table = Figures(), result.model.table
     if len(result.time) > 1:
         figures |= draw_tips(result.time, measure_reach(result.pose, table), table)
-    with contextlib.suppress(BadData):  # no joint has both of its segments
-        figures["angles"] = draw_joint_angles(joint_angles(result.pose, AUTO))
+    if (angles := _compute_angles(result)) is not None:
+        figures["angles"] = draw_joint_angles(angles)
     return figures
 
 

@@ -146,9 +146,10 @@ def check_person_arms(
         missing += [name for name in limb.points if points is not None and name not in points]
         if missing:
             base, upper, fore = (table.shared_name(name).replace("_", " ") for name in needed)
+            other = "".join(f", or choose arm {side}" for side in robot.map.arms if side != arm.side)
             raise BadData(
                 f"{robot.map.name}'s {arm.side} arm follows {', '.join(missing)}, which the sensors do not measure; an "
-                f"arm needs sensors on {base}, {upper} and {fore}; of two arms choose the other one"
+                f"arm needs sensors on {base}, {upper} and {fore}{other}"
             )
 
 
