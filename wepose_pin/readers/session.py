@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 import polars as pl
@@ -38,6 +38,8 @@ from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device, check_measured
 from .registry import detect_format, find_format, read_device
 
+T = TypeVar("T")
+
 # Suffixes of data files.
 DATA = (
     *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto"),
@@ -59,9 +61,14 @@ _UNITS = {"time_unit": TIME_UNITS, "gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_
 _CHOICES: dict[str, Collection[str]] = {"use": NEEDED, **_UNITS}
 
 
+_NO_TABLE = TomlTable({}, "")
+
+
 class SensorKeys(NamedTuple):
     """The keys of a sensor's table, or of [data], which hold for every sensor that does not state them."""
 
+    table: Annotated[TomlTable, None] = _NO_TABLE  # the sensor's own
+    data: Annotated[TomlTable, None] = _NO_TABLE
     file: str = ""
     format: str = ""
     use: Annotated[str, Key(of="use")] = ""
@@ -77,6 +84,17 @@ class SensorKeys(NamedTuple):
     # Signal → columns, or one array; empty where the file's format defines them.
     signals: Annotated[Mapping[str, list[str]], None] = MappingProxyType({})
     mount: Annotated[np.ndarray | None, None] = None  # (4,) xyzw
+
+    @property
+    def path(self) -> Path:
+        """The sensor's file; `BadSession`: none is named."""
+        if not self.file:
+            raise BadSession(f"{self.data.at('file')} is missing; the .csv or .parquet file beside {self.data.file}")
+        return Path(self.data.file).parent / self.file
+
+    def at(self, key: str) -> str:
+        """Return the place of a key, which may stand in [data]."""
+        return (self.table if key in self.table else self.data).at(key)
 
 
 def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> TomlTable:
@@ -142,7 +160,7 @@ def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
 
 def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
     """Read the keys of a sensor; those that its table lacks are those of [data]."""
-    keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))
+    keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))._replace(table=table)
     if "time" in table or "rate_hz" in table:  # one replaces the other
         keys = keys._replace(time=table.text("time", None) or "", rate_hz=table.number("rate_hz", None))
     if "mount" in table:
@@ -161,13 +179,13 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
     return keys._replace(signals=signals)
 
 
-def _check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
+def _check_columns(keys: Mapping[str, SensorKeys]) -> None:
     """Raise `BadSession` where two sensors name one column."""
     owners: dict[tuple[str, str], str] = {}
     for name, each in keys.items():
         for signal, column in ((signal, column) for signal, own in each.signals.items() for column in own):
             if (owner := owners.setdefault((each.file, column), name)) != name:
-                place = tables[name].at(signal)
+                place = each.table.at(signal)
                 raise BadSession(f"{place}: '{column}' of {each.file} is a column of sensors.{owner} too")
 
 
@@ -206,31 +224,36 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     """
     top = read_session_file(path, values)
     path = Path(top.file)
-    stated, files = top.table("sensors", {}), _Files(path, top.table("data"))
+    stated, data = top.table("sensors", {}), top.table("data")
+    common = read_record(SensorKeys, data, _CHOICES, others=("truth",))._replace(data=data)
     # Whether the names are segments, and the start pose one of theirs, is checked where the body is known.
-    tables = {name: stated.table(name) for name in stated.values}
-    keys = {name: read_sensor_keys(table, files.keys) for name, table in tables.items()}
+    keys = {name: read_sensor_keys(stated.table(name), common) for name in stated.values}
     keys = {name: each for name, each in keys.items() if not each.ignore}
-    _check_columns(tables, keys)
+    _check_columns(keys)
     if not keys:
         raise BadSession(f"{path}: no sensors; one [sensors.<segment>] table each, without # before its lines")
     head = read_head(top)
-    devices = {name: files.open_device(tables[name], each) for name, each in keys.items() if not each.signals}
+    contents: dict[Any, Any] = {}  # of the files, each read once, and their clocks
+    devices = {name: _open_device(each, contents) for name, each in keys.items() if not each.signals}
     alike = len({bool(each.signals) for each in keys.values()}) == 1
     clocks: dict[str, Clock] = {}  # of each sensor, with lost rows filled in
     rows: dict[str, Sensor] = {}  # as its file has them, without lost rows
     for name, each in keys.items():
-        table, unused = tables[name], OF_FORMATS if each.signals else OF_COLUMNS
-        for key, own in ((key, own) for own in (table, *[files.data] * alike) for key in unused if key in own):
+        unused = OF_FORMATS if each.signals else OF_COLUMNS
+        for key, own in ((key, own) for own in (each.table, *[data] * alike) for key in unused if key in own):
             why = "the columns are named here" if each.signals else "the format of the file defines it"
             raise BadSession(f"{own.at(key)} has no effect, as {why}; remove it")
         if name in devices:
-            clocks[name], rows[name] = files.take_sensor(name, table, each, devices)
+            clocks[name], rows[name] = _take_sensor(name, each, devices, contents)
         else:
-            clocks[name], rows[name] = files.read_sensor(table, each)
-    places = {name: f"{files.find_file(each)}: {tables[name].place}" for name, each in keys.items()}
-    diagnostics = files.diagnostics
-    del files  # of a day its tables are gigabytes
+            clocks[name], rows[name] = _read_sensor(each, contents)
+    places = {name: f"{each.path}: {each.table.place}" for name, each in keys.items()}
+    diagnostics = [own for content in contents.values() for own in getattr(content, "diagnostics", ())]
+    packets = {id(clock): (keys[name].path.name, clock.packet) for name, clock in clocks.items() if clock.packet > 1}
+    for file, size in packets.values():
+        facts: dict[str, float | str] = {"variant": "packets", "packet": size}
+        diagnostics.append(Diagnostic("time-stamps-uneven", INFO, file, facts=facts))
+    del contents  # of a day its tables are gigabytes
     time, resampled = find_common_time(str(path), clocks)
     check_phases(str(path), time, head.phases)
     start = next(iter(head.phases.get("start", ())), None)
@@ -253,123 +276,96 @@ def _signals(sensor: Sensor) -> dict[str, np.ndarray]:
     return {signal: getattr(sensor, name) for signal, name in _FIELDS.items() if hasattr(sensor, name)}
 
 
-class _Files:
-    """The files that a session names, each read once."""
-
-    def __init__(self, path: Path, data: TomlTable) -> None:
-        self.path, self.data = path, data
-        self.keys = read_record(SensorKeys, data, _CHOICES, others=("truth",))
-        self.diagnostics: list[Diagnostic] = []  # what devices assumed, and files whose times are those of packets
-        self._read: dict[tuple[object, ...], Any] = {}
-
-    def find_file(self, keys: SensorKeys) -> Path:
-        """Find the file of a sensor; `BadSession`: none is named."""
-        if not keys.file:
-            raise BadSession(f"{self.data.at('file')} is missing; the .csv or .parquet file beside {self.path}")
-        return self.path.parent / keys.file
-
-    def _at(self, table: TomlTable, key: str) -> str:
-        """Return the place of a key of a sensor, which may stand in [data]."""
-        return (table if key in table else self.data).at(key)
-
-    def _once(self, read: Callable[..., Any], *arguments: Any) -> Any:
-        """Read a file, and take its diagnostics, the first time that it is read so."""
-        key = (read, *arguments)
-        if key not in self._read:
-            self._read[key] = content = read(*arguments)
-            self.diagnostics += getattr(content, "diagnostics", ())
-        return self._read[key]
-
-    def open_device(self, table: TomlTable, keys: SensorKeys) -> Device:
-        """Read the file of a sensor without columns, whose format defines them."""
-        path = self.find_file(keys)
-        if not keys.format and not path.exists():
-            raise MissingFile(f"{path}: no such file or folder")
-        place = self._at(table, "format")
-        format = find_format(keys.format, self.path.parent, place) if keys.format else detect_format(path)
-        if format is None:
-            table.names("gyro", WIDTHS["gyro"])  # an error: the session must name the columns of a table
-        device: Device = self._once(read_device, path, str(format), keys.use or None, keys.rate_hz)
-        return device
-
-    def take_sensor(
-        self, segment: str, table: TomlTable, keys: SensorKeys, devices: Mapping[str, Device]
-    ) -> tuple[Clock, Sensor]:
-        """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor.
-
-        Devices whose clocks start at power-on are shifted together, so that the earliest begins at zero.
-        """
-        path, device = self.find_file(keys), devices[segment]
-        labels = [label for label, each in device.sensors.items() if each.segment == segment] or list(device.sensors)
-        if keys.label:
-            labels = [table.choice("label", device.sensors, keys.label)]
-        if len(labels) != 1:
-            raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
-        sensor = device.sensors[labels[0]]
-        offset_s = keys.offset_s
-        if device.since_power_on:
-            offset_s -= min(each.begin for each in devices.values() if each.since_power_on)
-        clock = self._build_clock((path, id(sensor.time), offset_s), path, sensor.time + offset_s, str(path))
-        if keys.mount is None:
-            keys = keys._replace(mount=sensor.mount)
-        if keys.aligned is None:
-            keys = keys._replace(aligned=device.aligned)
-        return clock, _make_sensor(table, keys, sensor.signals)
-
-    def read_sensor(self, table: TomlTable, keys: SensorKeys) -> tuple[Clock, Sensor]:
-        """Read the columns or arrays of a sensor, which the session names."""
-        path = self.find_file(keys)
-        if bool(keys.time) == (keys.rate_hz is not None):
-            stated = "both is" if keys.time else "neither is"
-            raise BadSession(f"{self._at(table, 'time')} or rate_hz is needed, one of the two, and {stated} there")
-        units = {"orientation": 1.0}
-        for signal, unit, known in (("gyro", keys.gyro_unit, GYRO_UNITS), ("accel", keys.accel_unit, ACCEL_UNITS)):
-            if signal in keys.signals and not unit:
-                raise BadSession(f"{self._at(table, f'{signal}_unit')} is missing; {one_of(known)}")
-            units[signal] = known.get(unit, 1.0)
-        columns = dict(keys.signals)
-        if is_array_file(path):
-            file = self._once(ArrayFile, path)
-            for signal, names in columns.items():
-                if len(names) == 1:
-                    columns[signal] = file.expand(names[0], WIDTHS[signal], table.at(signal))
-            places = {name: table.at(signal) for signal, names in columns.items() for name in names}
-            content = file.table(places | ({keys.time: self._at(table, "time")} if keys.time else {}))
-        else:
-            for signal in (signal for signal, names in columns.items() if len(names) == 1):
-                table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
-            content = self._once(read_table, path)
-        if keys.rate_hz is not None:
-            time, source = np.arange(content.height) / keys.rate_hz, self._at(table, "rate_hz")
-        else:
-            time, source = read_columns(content, [keys.time], str(path), self._at(table, "time"))[:, 0], str(path)
-            time = TIME_UNITS[keys.time_unit] * time
-        key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
-        clock = self._build_clock(key, path, time + keys.offset_s, source)
-        signals = {
-            signal: units[signal] * read_columns(content, names, str(path), table.at(signal))
-            for signal, names in columns.items()
-        }
-        if (read_table, path) in self._read:  # columns that have been read make room: of a day the table is gigabytes
-            read = [name for names in columns.values() for name in names]
-            self._read[read_table, path] = content.with_columns(pl.lit(None).alias(name) for name in read)
-        return clock, _make_sensor(table, keys, signals)
-
-    def _build_clock(self, key: tuple[object, ...], path: Path, time: np.ndarray, source: str) -> Clock:
-        """Build the clock of sensors, once of those that share it."""
-        if key not in self._read:
-            self._read[key] = clock = build_clock(time, source)
-            if clock.packet > 1:
-                facts: dict[str, float | str] = {"variant": "packets", "packet": clock.packet}
-                self.diagnostics.append(Diagnostic("time-stamps-uneven", INFO, path.name, facts=facts))
-        built: Clock = self._read[key]
-        return built
+def _once(contents: dict[Any, Any], key: Any, read: Callable[..., T], *arguments: Any) -> T:
+    """Return what `read` returns of the arguments; for each key it is called once."""
+    if key not in contents:
+        contents[key] = read(*arguments)
+    content: T = contents[key]
+    return content
 
 
-def _make_sensor(table: TomlTable, keys: SensorKeys, signals: Mapping[str, np.ndarray]) -> Sensor:
+def _open_device(keys: SensorKeys, contents: dict[Any, Any]) -> Device:
+    """Read the file of a sensor without columns, whose format defines them."""
+    path = keys.path
+    if not keys.format and not path.exists():
+        raise MissingFile(f"{path}: no such file or folder")
+    folder, place = Path(keys.data.file).parent, keys.at("format")
+    format = find_format(keys.format, folder, place) if keys.format else detect_format(path)
+    if format is None:
+        keys.table.names("gyro", WIDTHS["gyro"])  # an error: the session must name the columns of a table
+    arguments = path, str(format), keys.use or None, keys.rate_hz
+    return _once(contents, arguments, read_device, *arguments)
+
+
+def _take_sensor(
+    segment: str, keys: SensorKeys, devices: Mapping[str, Device], contents: dict[Any, Any]
+) -> tuple[Clock, Sensor]:
+    """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor.
+
+    Devices whose clocks start at power-on are shifted together, so that the earliest begins at zero.
+    """
+    path, table, device = keys.path, keys.table, devices[segment]
+    labels = [label for label, each in device.sensors.items() if each.segment == segment] or list(device.sensors)
+    if keys.label:
+        labels = [table.choice("label", device.sensors, keys.label)]
+    if len(labels) != 1:
+        raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
+    sensor = device.sensors[labels[0]]
+    offset_s = keys.offset_s
+    if device.since_power_on:
+        offset_s -= min(each.begin for each in devices.values() if each.since_power_on)
+    clock = _once(contents, (path, id(sensor.time), offset_s), build_clock, sensor.time + offset_s, str(path))
+    if keys.mount is None:
+        keys = keys._replace(mount=sensor.mount)
+    if keys.aligned is None:
+        keys = keys._replace(aligned=device.aligned)
+    return clock, _make_sensor(keys, sensor.signals)
+
+
+def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sensor]:
+    """Read the columns or arrays of a sensor, which the session names."""
+    path, table = keys.path, keys.table
+    if bool(keys.time) == (keys.rate_hz is not None):
+        stated = "both is" if keys.time else "neither is"
+        raise BadSession(f"{keys.at('time')} or rate_hz is needed, one of the two, and {stated} there")
+    units = {"orientation": 1.0}
+    for signal, unit, known in (("gyro", keys.gyro_unit, GYRO_UNITS), ("accel", keys.accel_unit, ACCEL_UNITS)):
+        if signal in keys.signals and not unit:
+            raise BadSession(f"{keys.at(f'{signal}_unit')} is missing; {one_of(known)}")
+        units[signal] = known.get(unit, 1.0)
+    columns, is_table = dict(keys.signals), not is_array_file(path)
+    for signal in (signal for signal, names in columns.items() if is_table and len(names) == 1):
+        table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
+    if is_table:
+        content = _once(contents, path, read_table, path)
+    else:
+        file = _once(contents, path, ArrayFile, path)
+        for signal, names in columns.items():
+            if len(names) == 1:
+                columns[signal] = file.expand(names[0], WIDTHS[signal], table.at(signal))
+        places = {name: table.at(signal) for signal, names in columns.items() for name in names}
+        content = file.table(places | ({keys.time: keys.at("time")} if keys.time else {}))
+    if keys.rate_hz is not None:
+        time, source = np.arange(content.height) / keys.rate_hz, keys.at("rate_hz")
+    else:
+        time, source = read_columns(content, [keys.time], str(path), keys.at("time"))[:, 0], str(path)
+        time = TIME_UNITS[keys.time_unit] * time
+    key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
+    clock = _once(contents, key, build_clock, time + keys.offset_s, source)
+    signals = {
+        signal: units[signal] * read_columns(content, names, str(path), table.at(signal))
+        for signal, names in columns.items()
+    }
+    if is_table:  # columns that have been read make room: of a day the table is gigabytes
+        read = [name for names in columns.values() for name in names]
+        contents[path] = content.with_columns(pl.lit(None).alias(name) for name in read)
+    return clock, _make_sensor(keys, signals)
+
+
+def _make_sensor(keys: SensorKeys, signals: Mapping[str, np.ndarray]) -> Sensor:
     """Make a sensor of its rows, in SI, as the file has them."""
-    if keys.aligned and ("mount" in table or "orientation" not in signals):
-        raise BadSession(f"{table.where}: aligned orientations are the segment's own: no mount, and no raw data")
+    if keys.aligned and ("mount" in keys.table or "orientation" not in signals):
+        raise BadSession(f"{keys.table.where}: aligned orientations are the segment's own: no mount, and no raw data")
     if "orientation" in signals:
         return OrientationSensor(signals["orientation"], keys.mount, aligned=bool(keys.aligned))
     return ImuSensor(signals["gyro"], signals["accel"], keys.mount)
