@@ -18,37 +18,23 @@ osim.Logger.removeFileSink()  # it would leave opensim.log where the tests are r
 
 
 def read(file: Path) -> dict[str, Any]:
-    """A .mot, a .trc, or a .sto of quaternions (wxyz): `labels`, `time` (n,), `values` (n, columns, …), `header`.
+    """A .mot or a .trc: `labels`, `time` (n,), `values` (n, columns, …), `header`.
 
     No class of this module: whoever unpickled one would import OpenSim.
     """
-    kind = {".mot": osim.TimeSeriesTable, ".trc": osim.TimeSeriesTableVec3, ".sto": osim.TimeSeriesTableQuaternion}
-    table = kind[file.suffix](str(file))
+    table = {".mot": osim.TimeSeriesTable, ".trc": osim.TimeSeriesTableVec3}[file.suffix](str(file))
     labels = list(table.getColumnLabels())
     rows = []
     for i in range(table.getNumRows()):
         row = table.getRowAtIndex(i)
         if file.suffix == ".mot":
             rows.append(row.to_numpy())
-        elif file.suffix == ".trc":
-            rows.append([row[k].to_numpy() for k in range(len(labels))])
         else:
-            rows.append([[row.getElt(0, k).get(c) for c in range(4)] for k in range(len(labels))])
+            rows.append([row[k].to_numpy() for k in range(len(labels))])
     keys = [key for key in ("inDegrees", "Units", "DataRate") if table.hasTableMetaDataKey(key)]
     header = {key: table.getTableMetaDataString(key) for key in keys}
     time = np.array(table.getIndependentColumn())
     return {"labels": labels, "time": time, "values": np.array(rows), "header": header}
-
-
-def read_as_storage(file: Path) -> tuple[str, int, int, bool]:
-    """Name, rows, columns, in degrees: of a .mot as the older reader has it."""
-    storage = osim.Storage(str(file))
-    return storage.getName(), storage.getSize(), storage.getColumnLabels().getSize(), storage.isInDegrees()
-
-
-def frames_of_marker_data(file: Path) -> int:
-    """Of a .trc as the older reader has it."""
-    return int(osim.MarkerData(str(file)).getNumFrames())
 
 
 def arm_model() -> Any:
@@ -154,23 +140,3 @@ def run_scale_tool(setup: Path, model: str) -> dict[str, np.ndarray]:
         child = scaled.getJointSet().get(k).getChildFrame()
         centres[child.findBaseFrame().getName()] = child.getPositionInGround(state).to_numpy()
     return centres
-
-
-def play(file: Path, labels: list[str]) -> np.ndarray:
-    """The coordinates [deg] (n, columns) through which the Analyze Tool moves the model of `arm_model`."""
-    folder = file.parent / "played"
-    folder.mkdir()
-    arm_model().printToXML(str(folder / "model.osim"))
-    tool = osim.AnalyzeTool()
-    tool.setName("x")
-    tool.setModelFilename(str(folder / "model.osim"))
-    tool.setCoordinatesFileName(str(file))
-    tool.setResultsDir(str(folder))
-    time = osim.TimeSeriesTable(str(file)).getIndependentColumn()
-    tool.setInitialTime(time[0])
-    tool.setFinalTime(time[-1])
-    tool.updAnalysisSet().cloneAndAppend(osim.Kinematics())
-    tool.printToXML(str(folder / "analyze.xml"))
-    osim.AnalyzeTool(str(folder / "analyze.xml")).run()
-    table = osim.TimeSeriesTable(str(folder / "x_Kinematics_q.sto"))
-    return np.column_stack([table.getDependentColumn(label).to_numpy() for label in labels])

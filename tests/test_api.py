@@ -22,7 +22,6 @@ import pytest
 from arms import write_arm
 
 import wepose_pin as wp
-from docs.diagnostics_page import list_examples
 from wepose_pin import Simulation
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
@@ -259,12 +258,6 @@ def test_objects_show_themselves_in_a_notebook(simulated: Simulation, result: wp
         page = each._repr_html_()
         assert escape(repr(each)) in page
         assert ElementTree.fromstring(f"<div>{page}</div>") is not None
-
-
-def test_a_diagnostic_prints_its_text() -> None:
-    text = str(list_examples()["length-uncertain", ""])
-    assert text.startswith("warning: ")
-    assert "{" not in text
 
 
 @pytest.mark.parametrize("name", ["anna", 'a"b\\c', "é α 漢", "line\nend\ttab", "\x00\x07\x7f\x80\u2028"])

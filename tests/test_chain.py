@@ -23,7 +23,6 @@ from wepose_pin import (
     load_model,
     load_result,
     load_session,
-    load_subject,
     track,
 )
 from wepose_pin.recording import compute_mount
@@ -251,22 +250,6 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     np.testing.assert_allclose(reach, 0.5, atol=1e-9)
 
 
-def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:
-    """A mount R_LS that was found holds from any start configuration; a stated one is of the start pose."""
-    recording, _ = made(urdf, MARKED_WITH_SENSORS, 12.0)
-    recording = replace(as_segments(recording), model=str(table))
-    stated = track(recording)
-    names = list(recording.sensors)
-    order = tuple(f"mounts.{name}.{axis}" for name in names for axis in "xyz")
-    person = Subject(
-        "arm", dict(load_model(table).lengths), order, 1e-6 * np.eye(len(order)), mounts=dict(stated.segments.quat_LS)
-    )
-    bare = {name: replace(sensor, stated_quat_LS=None) for name, sensor in recording.sensors.items()}
-    tracked = track(replace(recording, sensors=bare), person)
-    for name, values in stated.joints.items():
-        np.testing.assert_allclose(tracked.joints[name], values, atol=np.deg2rad(0.1))
-
-
 def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> None:
     recording, _ = made(urdf, MARKED_WITH_SENSORS, 20.0)
     whole = track(recording, model=urdf)
@@ -278,20 +261,6 @@ def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> 
     last = len(causal.time)
     for name, values in causal.joints.items():
         np.testing.assert_allclose(values, whole.joints[name][-last:], atol=np.deg2rad(0.5))
-
-
-def test_a_subject_of_a_body_without_lengths(urdf: Path, tmp_path: Path) -> None:
-    """It holds mounts alone; its files give the same result again."""
-    recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)
-    tracked = track(recording, model=urdf)
-    person = replace(tracked.subject, mounts=dict(tracked.segments.quat_LS))
-    out = replace(tracked, subject=person).save(tmp_path / "out")
-    again = track(recording, load_subject(out), model=out / "subject.urdf")
-    assert again.model.table.is_mechanism
-    for name, values in tracked.joints.items():
-        np.testing.assert_allclose(again.joints[name], values, atol=1e-6)
-    with pytest.raises(WeposeError, match=r"trunk, shoulder_width.* of the body upper_body is missing"):
-        track(replace(recording, sensors={"torso": recording.sensors["forearm_link"]}, start_pose="n_pose"), person)
 
 
 def test_a_person_may_begin_in_another_pose() -> None:

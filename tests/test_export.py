@@ -224,21 +224,6 @@ def test_bvh_of_one_arm_without_its_forearm(tmp_path: Path) -> None:
         export(write_folder(tmp_path / "s", a_pose(("left_forearm",), n=20)), tmp_path / "y.bvh")
 
 
-def test_bvh_of_a_body_with_a_spine(tmp_path: Path, data: Path) -> None:
-    pybvh = pytest.importorskip("pybvh")
-    model = load_model(data / "human_urdf" / "humanSubject01_66dof.urdf")
-    upright = a_pose(n=40)
-    pose = compute_pose(model, upright.time, upright.quat_WL)
-    folder = write_folder(tmp_path / "r", pose)
-    (folder / "subject.urdf").write_text(model.urdf(), encoding="utf-8")
-    export(folder, tmp_path / "x.bvh")
-    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
-    names = [node.name for node in read.nodes]
-    at = {joint: read.node_positions()[:, names.index(joint)] for joint in BVH_POINTS}
-    middle = 0.5 * (pose.points["left_shoulder"] + pose.points["right_shoulder"])
-    np.testing.assert_allclose(0.5 * (at["LeftArm"] + at["RightArm"]), in_bvh(middle), atol=1e-5)
-
-
 # URDF, rates, options -----------------------------------------------------------------------------------------------
 
 

@@ -211,10 +211,6 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
     wanted = np.degrees(np.column_stack([values[label] for label in table["labels"]]))
     # The .osim has the axes of the forearm and its right angles to five digits.
     np.testing.assert_allclose(table["values"], wanted, atol=2e-3)
-    export(folder, tmp_path / "both.mot")
-    played = peer("play", tmp_path / "both.mot", table["labels"])  # with columns it has no use for
-    np.testing.assert_allclose(played, wanted, atol=2e-3)
-    assert peer("read_as_storage", tmp_path / "x.mot") == ("a - made² one", 60, 1 + len(values), True)
 
 
 @pytest.mark.peer
@@ -260,14 +256,3 @@ def test_trc_by_opensim(peer: Callable[..., Any], tmp_path: Path) -> None:
         if point in ("right_wrist", "right_palm"):  # the last of a row among them
             wanted[10:20] = np.nan
         np.testing.assert_allclose(table["values"][:, k], wanted, atol=1e-6)
-    assert peer("frames_of_marker_data", tmp_path / "x.trc") == 301
-
-
-@pytest.mark.peer
-def test_sto_by_opensim(peer: Callable[..., Any], result: Path, tmp_path: Path) -> None:
-    export(result, tmp_path / "x.sto")
-    table = peer("read", tmp_path / "x.sto")
-    assert table["labels"] == [f"{body}_imu" for body in SEGMENT_OF]
-    x, y, z, w = a_pose().quat_WL["torso"].T
-    same = np.einsum("nc,nc->n", table["values"][:, 1], np.column_stack([w, x, z, -y]))
-    np.testing.assert_allclose(np.abs(same), 1.0, atol=1e-8)

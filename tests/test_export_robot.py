@@ -152,32 +152,6 @@ def find_lerobot() -> str:
     return python
 
 
-@pytest.mark.peer
-def test_lerobot_loads_it(trajectory: Path, tmp_path: Path) -> None:
-    """lerobot needs PyTorch: WEPOSE_LEROBOT names the Python of an environment that has it."""
-    python = find_lerobot()
-    other = write_trajectory_folder(tmp_path / "other", seed=2)
-    export([trajectory, other], tmp_path / "data", "lerobot", episodes="reach")
-    script = Path(__file__).with_name("lerobot_peer.py")
-    ran = subprocess.run([python, "-W", "ignore", str(script), str(tmp_path / "data")], capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
-    got = json.loads(ran.stdout)
-    whole = [
-        (read_positions(folder), at) for folder in (trajectory, other) for at in (slice(100, 151), slice(175, 236))
-    ]
-    state, action = (
-        np.concatenate([rows[at.start + k : at.stop + k] for rows, at in whole]).astype(np.float32) for k in (0, 1)
-    )
-    assert (got["fps"], got["robot"], got["joints"], got["dtype"]) == (50, "arm", list(JOINTS), "torch.float32")
-    assert (got["episodes"], got["lengths"], got["frames"]) == (4, [51, 61, 51, 61], 224)
-    np.testing.assert_array_equal(np.array(got["state"], dtype=np.float32), state)
-    np.testing.assert_array_equal(np.array(got["action"], dtype=np.float32), action)
-    np.testing.assert_array_equal(np.array(got["next_actions"], dtype=np.float32), action[:3])
-    np.testing.assert_allclose(got["mean"], action.mean(0, dtype=float), atol=1e-9)
-    assert got["tasks"] == ["follow session 1, reach"] * 112 + ["follow session 2, reach"] * 112
-    assert (got["ahead"], got["last_episode"]) == ([8, 3, 7], 61)
-
-
 # What is wrong ----------------------------------------------------------------------------------------------------
 
 

@@ -259,22 +259,6 @@ def test_devices_that_were_switched_on_at_other_times_need_an_offset(tmp_path: P
         load_file(tmp_path, "a", data='use = "orientation"')
 
 
-@pytest.mark.parametrize("where", ["data", "sensors"])
-@pytest.mark.parametrize(("unit", "a_second"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
-def test_times_in_the_unit_that_is_stated(unit: str, a_second: float, where: str, tmp_path: Path) -> None:
-    """Once in [data], or by each sensor, whose own clock goes before that of [data]."""
-    clock = f"time = 't'\ntime_unit = '{unit}'\n"
-    text = f"[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n{clock if where == 'data' else 'rate_hz = 50'}\n"
-    for file, name in (("a.csv", "torso"), ("b.csv", "left_forearm")):
-        columns = np.column_stack([a_second * TIME, GYRO, df.own(ACCEL, Path(file))])
-        pl.DataFrame(columns, schema=["t", *"abcdef"]).write_csv(tmp_path / file)
-        text += f"[sensors.{name}]\nfile = '{file}'\ngyro = ['a', 'b', 'c']\naccel = ['d', 'e', 'f']\n"
-        text += clock if where == "sensors" else ""
-    check_raw(load(tmp_path, text), "left_forearm")
-    with pytest.raises(BadSession, match=r"time_unit = 'min' is not known; there is: s, ms, us, ns"):
-        load(tmp_path, text.replace(f"'{unit}'", "'min'"))
-
-
 def test_samples_of_one_packet_are_spread_and_two_clocks_joined_at_the_times_of_the_rates(tmp_path: Path) -> None:
     """A Shimmer stamps two samples alike. A phone's force comes 3 ms later, and ten samples of it are lost."""
     file = df.shimmer(tmp_path / "a.csv")

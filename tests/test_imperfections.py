@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +12,9 @@ from wepose_pin import (
     IDEAL_PRESET,
     PEOPLE_PRESET,
     Imperfections,
-    ImuSensor,
-    Recording,
     Simulation,
-    load_session,
     simulate,
 )
-from wepose_pin.writers import write_session
 
 SHORTER = {"clasp_s": 5.0, "circles": 0, "rate_hz": 30.0}
 # Of the body: imperfection -> it turns segments, and not only sensors on them.
@@ -57,22 +52,6 @@ def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:
 
 
 # Sensors ---------------------------------------------------------------------------------------------------------
-
-
-def test_lost_samples_are_bridged_as_in_a_users_file(tmp_path: Path) -> None:
-    people = simulate(SUBJECT, seed=5, imperfections=replace(PEOPLE_PRESET, dropped=0.02), **SHORTER)
-    recorded = people.recording()
-    raw = {
-        segment: ImuSensor(people.gyro_S[segment], people.accel_S[segment], sensor.stated_quat_LS)
-        for segment, sensor in recorded.sensors.items()
-    }
-    assert sum(np.isnan(sensor.gyro_S[:, 0]).sum() for sensor in raw.values()) > 10
-    write_session(tmp_path, Recording("raw", recorded.time, recorded.rate_hz, raw, recorded.phases))
-    read = load_session(tmp_path)
-    for segment, sensor in recorded.sensors.items():
-        np.testing.assert_allclose(read.sensors[segment].gyro_S, sensor.gyro_S, rtol=1e-12)
-        np.testing.assert_allclose(read.sensors[segment].accel_S, sensor.accel_S, rtol=1e-12)
-        assert not np.array_equal(sensor.gyro_S, people.gyro_S[segment])
 
 
 # Switches --------------------------------------------------------------------------------------------------------

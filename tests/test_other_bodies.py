@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from reading import headings, rows, text_of
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import (
     BodyModel,
-    ImuSensor,
     OrientationSensor,
     Recording,
     Subject,
@@ -135,31 +133,6 @@ def test_knees_bend_forwards(tracked: TrackResult) -> None:
     np.testing.assert_allclose(tracked.points["left_toe"][0], [FOOT, HIP, -THIGH - SHANK], atol=1e-6)
 
 
-def test_its_report_has_its_words(tracked: TrackResult, tmp_path: Path) -> None:
-    """From gyroscopes and accelerometers, so that the page has all its sections."""
-    rng = np.random.default_rng(4)
-    sensors = {}
-    for name, quat in squats(tracked.time)[1].items():
-        R = Rotation.from_quat(quat)
-        rate = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * 50.0])
-        force = R.inv().apply([0.0, 0.0, 9.81])
-        sensors[name] = ImuSensor(
-            rate + rng.normal(0.0, 0.003, rate.shape),
-            force + rng.normal(0.0, 0.02, force.shape),
-            np.array([0.0, 0.0, 0.0, 1.0]),
-        )
-    measured = track(replace(tracked.recording, sensors=sensors), model=tracked.model)
-    page = (measured.save(tmp_path / "result") / "report.html").read_text(encoding="utf-8")
-    assert "The feet" in headings(page)
-    text = text_of(page)
-    named = [row[0] for row in rows(page) if row[0].endswith(("hip", "knee", "ankle"))]
-    assert list(dict.fromkeys(named)) == [  # points and joints, in tables of their own
-        f"{side} {joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle")
-    ]
-    assert "The feet, from the middle of the hips along the pelvis's own axes" in text
-    assert not re.search(r"elbow|forearm|shoulder|palm|\bhands\b", text.split("Joint angles")[0])
-
-
 def test_its_result_is_read_exported_and_evaluated(tracked: TrackResult, tmp_path: Path) -> None:
     result = load_result(tracked.save(tmp_path / "result"))
     assert result.model.table.draw.paths == ("left_toe", "right_toe")
@@ -199,30 +172,11 @@ paths = ["tip"]
 """
 
 
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> BodyModel:
-    folder = tmp_path_factory.mktemp("arm")
-    (folder / "arm.urdf").write_text(ROBOT, encoding="utf-8")
-    (folder / "arm.toml").write_text(ROBOT_TABLE, encoding="utf-8")
-    return load_model(folder / "arm.toml")
-
-
 def as_result(model: BodyModel, lift: np.ndarray, bend: np.ndarray) -> TrackResult:
     R_upper = Rotation.from_euler("x", 0.5) * Rotation.from_euler("z", lift[:, None])
     quat_WL = {"upper": R_upper.as_quat(), "lower": (R_upper * Rotation.from_euler("y", bend[:, None])).as_quat()}
     pose = compute_pose(model, np.arange(len(lift)) / 50.0, quat_WL)
     return TrackResult("arm", pose, model, Subject("arm", {}, (), np.zeros((0, 0))))
-
-
-def test_a_robots_tip_lies_where_it_is(robot: BodyModel, tmp_path: Path) -> None:
-    swing = np.sin(np.arange(0.0, 2.0, 0.02))
-    result = as_result(robot, swing, swing)
-    R_upper, R_lower = (Rotation.from_quat(result.quat_WL[name]) for name in ("upper", "lower"))
-    expected = [0.0, 0.0, 0.3] + R_upper.apply([0.4, 0.0, 0.0]) + R_lower.apply([0.3, 0.0, 0.0])
-    np.testing.assert_allclose(result.points["tip"], expected, atol=1e-9)
-    with pytest.raises(WeposeError, match="no orientation of a person's upper"):
-        export(result, tmp_path / "m.bvh")
-    assert evaluate(result, result).position_on_limb["tip"].worst == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_robots_joints_are_in_a_mot_and_a_csv(tmp_path: Path) -> None:

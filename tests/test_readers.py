@@ -153,9 +153,6 @@ def test_csv_as_programs_write_it(change, tmp_path: Path) -> None:
     path = write(tmp_path, table)
     (tmp_path / "hand.csv").write_bytes(change(table.write_csv()).encode())
     assert same(load_session(path), load_session(write(tmp_path, table, file="hand.parquet")))
-    (path := write(tmp_path, table)).touch()
-    (tmp_path / "hand.csv").write_bytes(change(table.write_csv()).encode())
-    assert len(load_session(path)) == 800
 
 
 # Lost samples ------------------------------------------------------------------------------------------------------
@@ -253,13 +250,14 @@ def test_an_uneven_rate_is_resampled_on_the_rotation(spread: float, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("own_rate", "sensor"), [(100.0, "offset_s = 0.25"), (97.3, ""), (1000.0, ""), (400.0, "rate_hz = 400.0")]
+    ("own_rate", "sensor"),
+    [(100.0, "offset_s = 0.25"), (97.3, ""), (1000.0, ""), (400.0, "rate_hz = 400.0"), (100.0, 'time_unit = "ms"')],
 )
 def test_sensors_with_clocks_of_their_own_come_to_one_time(own_rate: float, sensor: str, tmp_path: Path) -> None:
     """The torso at 100 Hz from 0 s, the head at its own rate on a clock that runs behind by `offset_s`."""
     offset = 0.25 if "offset" in sensor else 0.0
     its_own = np.arange(0.0, 9.0, 1.0 / own_rate) + (0.003 if "rate_hz" not in sensor else 0.0)
-    head = table_at(its_own).with_columns(pl.col("time") - offset)
+    head = table_at(its_own).with_columns((pl.col("time") - offset) * (1e3 if "unit" in sensor else 1.0))
     path = write(tmp_path, table_at(np.arange(1000) / 100.0), sensor=sensor, head=head)
     recording = load_session(path)
     time = recording.time
@@ -347,19 +345,6 @@ def test_saturation_is_told_from_noise_of_any_size(noise: float) -> None:
     assert count == 20
 
 
-@pytest.mark.parametrize(("peak", "hertz"), [(9.0, 2.0), (10.0, 4.0)])
-def test_many_short_peaks_that_are_cut_off_are_saturated(peak: float, hertz: float) -> None:
-    """Four samples at 500 deg/s, twice in each swing, after five seconds at rest."""
-    time, limit = np.arange(3000) / 100.0, np.deg2rad(500.0)
-    gyro = 0.005 * np.random.default_rng(0).standard_normal((3000, 3))
-    gyro[:, 0] += (time > 5.0) * peak * np.sin(2.0 * np.pi * hertz * time)
-    whole, cut = (np.round(np.clip(gyro, -most, most) / 0.001) * 0.001 for most in (np.inf, limit))
-    assert not find_saturation(whole, 2.0).any()
-    saturated = find_saturation(cut, 2.0)
-    assert np.count_nonzero(saturated[:, 0]) > 0.8 * np.count_nonzero(np.abs(gyro[:, 0]) > limit)
-    assert not saturated[:, 1:].any()
-
-
 def test_a_scale_that_is_off_is_noted(tmp_path: Path) -> None:
     table = table_at(np.arange(1000) / 100.0).with_columns(pl.col(SIGNALS["accel"]) * 1.1)
     (scale,) = load_session(write(tmp_path, table)).diagnostics
@@ -412,15 +397,6 @@ def test_real_recordings_raise_no_alarm_and_their_units_are_told_apart(data: Pat
         except BadData as error:
             caught += 'gyro_unit = "deg/s" would fit' in str(error)
     assert caught >= len(sensors) - 5  # the arm of the UR5 hardly turns about horizontal axes
-
-
-def test_the_upper_body_session_reads_without_a_diagnostic(data: Path) -> None:
-    recording = load_session(data / "upper_body")
-    assert recording.diagnostics == ()
-    table = read_table(data / "upper_body" / "upper_body.csv")
-    for segment, sensor in recording.sensors.items():
-        np.testing.assert_array_equal(sensor.gyro_S, table[[f"{segment}_gyr_{axis}" for axis in "xyz"]])
-    assert same(recording, recording)
 
 
 def test_a_phase_may_exceed_the_file_by_a_few_samples(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import run
-from device_files import mvnx, turning
 from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
 
@@ -306,19 +305,6 @@ def test_a_table_of_markers_of_ones_own(brief: Pose, tmp_path: Path) -> None:
         (tmp_path / "m.toml").write_text(text)
         with pytest.raises(WeposeError, match=says):
             read_reference(path, tmp_path / "m.toml")
-
-
-def test_an_mvnx_without_its_t_pose_is_a_reference_with_a_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = mvnx(tmp_path, turning(100), t_pose=None)
-    labels = {"T8": "torso", "LeftUpperArm": "left_upper_arm", "LeftForeArm": "left_forearm"}
-    sensors = "".join(f'[sensors.{segment}]\nlabel = "{label}"\n' for label, segment in labels.items())
-    (tmp_path / "session.toml").write_text(f'[data]\nfile = "trial.mvnx"\n{sensors}')
-    assert run("track", tmp_path / "session.toml", "--no-report", "-o", tmp_path / "result") == 0
-    capsys.readouterr()
-    assert run("evaluate", tmp_path / "result", file, "--no-align") == 0
-    assert "warning: trial.mvnx has no frame of type tpose" in capsys.readouterr().err
 
 
 # Files that are wrong -----------------------------------------------------------------------------------------------

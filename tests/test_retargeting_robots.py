@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from arms import FORE, HAND, UPPER, is_sound, person
 from scipy.spatial.transform import Rotation
 
-import wepose_pin as wp
 from wepose_pin import retargeting
 from wepose_pin.body.kinematics import Pose
 from wepose_pin.body.urdf import find_example_data
@@ -68,24 +66,3 @@ def violent(hz: float, swing: float, across: float, bend: float, phase: float, s
 def test_violent_arms_do_not_touch(motion: tuple[float, ...]) -> None:
     """Hands that meet, the body, and links of one arm that touch only where its joints end."""
     is_sound(retargeting.retarget(violent(*motion), retargeting.load_robot(retargeting.find_map("talos"))))
-
-
-@pytest.fixture(scope="session")
-def tracked(data: Path) -> Pose:
-    return wp.track(wp.load_session(data / "upper_body" / "session.toml")).pose
-
-
-@pytest.mark.parametrize("name", ["panda", "ur5", "baxter", "tiago_dual"])
-def test_the_real_recording(tracked: Pose, name: str) -> None:
-    """Ten seconds of work at a table, the most agile of the recording."""
-    keep = (tracked.time > 60.0) & (tracked.time < 70.0)
-    pose = Pose(
-        tracked.time[keep],
-        {segment: quat[keep] for segment, quat in tracked.quat_WL.items()},
-        {point: p[keep] for point, p in tracked.points.items()},
-        point_cov={point: cov[keep] for point, cov in tracked.point_cov.items()},
-    )
-    robot = retargeting.load_robot(retargeting.find_map(name))
-    trajectory = retargeting.retarget(pose, robot)
-    is_sound(trajectory)
-    assert not trajectory.report.stopping.any()
