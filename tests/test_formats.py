@@ -451,7 +451,7 @@ def test_a_damaged_file_is_one_line(
         ("opensim", (b"time\ttorso_imu", b"torso_imu\ttime"), "cannot be read as an OpenSim .sto"),
         ("opensim", (b"1.000000000,0.", b"one,0."), "in column 'torso_imu'; .*one"),
         ("shimmer", (b"deg/s", b"furl"), r"'Shimmer_8665_Gyro_X_CAL' is in 'furl'; there is: rad/s, deg/s"),
-        ("shimmer", (b"Gyro", b"Gxxx"), "no sensor in it has Gyro and Accel_LN or Accel_WR, nor Quat"),
+        ("shimmer", (b"Gyro", b"Gxxx"), "no sensor in it has Gyro and Accel_LN or Accel_WR, or Quat"),
         ("noraxon", (b"Gyroscope", b"Gxxx"), "no sensor in it has both Gyroscope and Acceleration"),
         ("noraxon", (b"(mG)", b"(V)"), "is in 'V'; there is: m/s"),
         ("delsys", (b"GYRO Z (deg/s)", b"EMG 2 (mV)"), "no sensor in it has three channels of ACC and three of GYRO"),

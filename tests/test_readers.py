@@ -140,7 +140,7 @@ def test_float32_integer_and_nullable_columns_load(tmp_path: Path) -> None:
     "change",
     [
         lambda text: "\ufeff" + text,
-        lambda text: "# made by a logger\n# rate: 100\n" + text,
+        lambda text: "# made by a logger\n" + 200 * "# rate: 100\n" + text,
         lambda text: text.replace("\n", "\r\n"),
         lambda text: text + "\n\n",
         lambda text: text + ",,,,,,,,,,\n",

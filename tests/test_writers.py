@@ -88,6 +88,7 @@ def test_what_is_no_result_is_named(result: wp.TrackResult, tmp_path: Path) -> N
         (table.drop("time"), "no column 'time'"),
         (table.select("time"), "neither orientations nor points"),
         (table.with_columns(pl.lit(2.0).alias("torso_qw")), "torso_qx … _qw is no unit quaternion in row"),
+        (table.with_columns(pl.lit(1e200).alias("torso_std")), "column 'torso_std' holds 1e\\+200 in row 1"),
         (table.with_columns(pl.lit("a").alias("torso_qw")), "holds text"),
     ):
         changed.write_parquet(out / "pose.parquet")

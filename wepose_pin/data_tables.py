@@ -21,9 +21,9 @@ from .errors import BadData, MissingFile, UnknownColumn, one_of
 from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
-LONGEST_LINE = 1 << 18  # [bytes] that are read of a file without line ends
+FIRST_BYTES = 1 << 20  # in which the first lines of a file stand
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
-MOST_PREAMBLE = 100  # first lines of a CSV in which its names stand
+MOST_PREAMBLE, MOST_COMMENTS = 100, 2000  # first lines of a CSV in which its names stand, and comments before them
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
 _UNITS = re.compile(
     r"[\[(]?(s|ms|[uµμ]s|ns|sec(onds?)?|m/\(?s(\^2|²|/s|\^2\))\)?|m/s\*\*2|m?g|deg(rees)?|rad|(deg|rad|°|dps)(/s(ec)?)?|"
@@ -57,9 +57,10 @@ def read_first_lines(path: Path, most: int = 100) -> list[str]:
     """Read the first lines of a text in UTF-8, or as Windows writes it; empty ones follow the end of the file."""
     try:
         with path.open("rb") as file:
-            lines = [file.readline(LONGEST_LINE).rstrip(b"\r\n") for _ in range(most)]
+            lines = [line.rstrip(b"\r") for line in file.read(FIRST_BYTES).split(b"\n", most)[:most]]
     except OSError as error:
         raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
+    lines += [b""] * (most - len(lines))
     try:
         return [line.decode("utf-8-sig") for line in lines]
     except UnicodeDecodeError:
@@ -192,8 +193,8 @@ def read_layout(path: Path) -> CsvLayout:
     they are in the line right above that row, or above a line of units. Raise `BadData` where the file is empty or no
     text.
     """
-    lines = enumerate(read_first_lines(path, MOST_PREAMBLE))
-    text = [(k, line) for k, line in lines if line.strip() and not line.startswith("#")]
+    lines = enumerate(read_first_lines(path, MOST_COMMENTS))
+    text = [(k, line) for k, line in lines if line.strip() and not line.startswith("#")][:MOST_PREAMBLE]
     if not text:
         raise BadData(f"{path}: is empty; a line with the names of the columns and then numbers are needed")
     if "\0" in text[0][1]:

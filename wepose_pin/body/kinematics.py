@@ -16,6 +16,7 @@ from .links import compute_axis_std
 
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
 MAX_TABLE_NORM_DEVIATION = 1e-2  # the same in a table: a file may have few decimals
+LARGEST_IN_TABLE = 1e6  # of a position, also in mm, or a standard deviation; more is damage
 # Columns of a quaternion, a position and a covariance in a table.
 _QUAT, _XYZ = ("qx", "qy", "qz", "qw"), ("x", "y", "z")
 _ENTRIES = {f"cov_{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
@@ -134,8 +135,8 @@ def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
 def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     """Parse a `Pose` from a table as of `build_pose_table`; segments and points may be missing.
 
-    Raise `BadData` where time is missing or does not increase, with neither orientations nor points, on a text, or on
-    a quaternion that is not of unit norm.
+    Raise `BadData` where time is missing or does not increase, with neither orientations nor points, on a text, on a
+    number that is none of a pose, or on a quaternion that is not of unit norm.
     """
     if "time" not in table.columns:
         raise BadData(f"{file}: no column 'time'; a table as in pose.parquet is needed; {one_of(table.columns)}")
@@ -152,6 +153,10 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
         names = [name.removesuffix(f"_{components[0]}") for name in numbers if name.endswith(f"_{components[0]}")]
         columns = {name: [f"{name}_{component}" for component in components] for name in names}
         complete = {name: own for name, own in columns.items() if set(own) <= set(numbers)}
+        for column in (column for own in complete.values() for column in own):
+            if (wrong := np.abs(numbers[column]) > LARGEST_IN_TABLE).any():
+                number, row = numbers[column][wrong][0], int(np.argmax(wrong)) + 1
+                raise BadData(f"{file}: column '{column}' holds {number:.3g} in row {row}; the file is damaged")
         return {name: np.column_stack([numbers[column] for column in own]) for name, own in complete.items()}
 
     quat_WL, points = collect(*_QUAT), collect(*_XYZ)

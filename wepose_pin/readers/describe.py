@@ -406,10 +406,10 @@ def _format_session(about: Description, folder: Path, body: BodyTable, model: Pa
             spans = f"[[{static[0][0]:.2f}, {static[0][1]:.2f}]]"
             lines.append(f"start = {spans}   # CHECK: all sensors are static there; is it the start pose?")
         else:
-            lines.append("# start = [[FROM, TO]]   # the seconds in which the person stands still in the start pose")
+            lines.append('# start = [["FROM", "TO"]]   # the seconds of standing still in the start pose')
         # A sensor on an unknown segment may be one that is needed.
         if body.draw.paths and not (set(about.sensors) <= set(segments) and set(body.needed) - set(about.sensors)):
-            lines.append("# clasp = [[FROM, TO]]   # for wepose calibrate: the seconds in which the palms are together")
+            lines.append('# clasp = [["FROM", "TO"]]   # for wepose calibrate: the seconds with the palms together')
     for segment in sorted(about.sensors, key=lambda name: segments.index(name) if name in segments else 99):
         known = segment in segments
         table = [f"[sensors.{segment if known else 'SEGMENT'}]"]
