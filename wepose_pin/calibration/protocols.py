@@ -25,7 +25,7 @@ import numpy as np
 
 from ..body import BodyModel, BodyTable, list_breadths
 from ..body.mounts import PALM_SLIP_STD, StartPose
-from ..body.table import Vector, check_segments
+from ..body.table import ZERO, Vector, check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, BadSession, one_of
 from ..libraries import asset
@@ -80,11 +80,11 @@ class Direction(NamedTuple):
     """
 
     phase: str
-    segment: str
-    direction: Vector
-    std: float
-    reference: str = ""  # segment of `direction`; that of the body which faces x
-    along: Vector = (0.0, 0.0, -1.0)  # the long axis
+    std: PoseStd
+    segment: Annotated[str, None] = ""
+    direction: Annotated[Vector, None] = ZERO
+    reference: Annotated[str, None] = ""  # segment of `direction`; that of the body which faces x
+    along: Annotated[Vector, None] = (0.0, 0.0, -1.0)  # the long axis
 
 
 class Axis(NamedTuple):
@@ -100,13 +100,6 @@ class FreeMotion(NamedTuple):
     """Limbs move freely."""
 
     phase: str  # of the session; empty: from the start pose on
-
-
-class _Pose(NamedTuple):
-    """What the directions of a pose share."""
-
-    phase: str
-    std: PoseStd
 
 
 Condition = Closure | Direction | Axis | FreeMotion
@@ -220,14 +213,14 @@ def _read_protocol(path: Path) -> Protocol:
     top.allow("name", "title", "needs", "measured_example", "step", "closure", "pose", "axis", "motion")
     conditions: list[Condition] = [_read_closure(entry) for entry in top.entries("closure")]
     for entry in top.entries("pose"):
-        pose, directions = read_record(_Pose, entry, others=("directions",)), entry.table("directions")
+        pose, directions = read_record(Direction, entry, others=("directions",)), entry.table("directions")
         for segment, value in directions.values.items():
             numbers = isinstance(value, list) and len(value) == 3 and all(is_number(v, 1e6) for v in value)
             length = float(np.linalg.norm(value)) if numbers else 0.0
             if not length > 1e-6:
                 raise BadOption(f"{directions.at(segment)} = {value}; three numbers are needed: x, y, z")
             x, y, z = (float(v) / length for v in value)
-            conditions.append(Direction(pose.phase, segment, (x, y, z), pose.std))
+            conditions.append(pose._replace(segment=segment, direction=(x, y, z)))
     conditions += [read_record(Axis, entry) for entry in top.entries("axis")]
     conditions += [read_record(FreeMotion, entry, base=FreeMotion("")) for entry in top.entries("motion")]
     if not conditions:
