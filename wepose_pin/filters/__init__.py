@@ -14,7 +14,7 @@ from ..arguments import check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
-from ..recording.faults import find_faults, find_gyro_range
+from ..recording.faults import find_faults, find_gyro_range, find_largest, has_repeats
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 from .amekf import AmekfParams
 from .base import Orientation, join_orientations
@@ -113,7 +113,7 @@ def estimate_orientation(
     kind = METHODS[method].params_type
     check_value("params", params, kind | None if kind else type(None))
     try:
-        gyro, accel = np.asarray(gyro_S, dtype=float), np.asarray(accel_S, dtype=float)
+        gyro, accel = (np.asarray(values, dtype=float, order="C") for values in (gyro_S, accel_S))
     except (TypeError, ValueError) as error:
         raise BadData(f"gyro_S and accel_S must be arrays of numbers (n, 3): {error}") from None
     if not (np.isfinite(rate_hz) and rate_hz > 0.0 and (static is None or np.isfinite(static).all())):
@@ -124,15 +124,18 @@ def estimate_orientation(
         ("gyro_S", gyro, HIGHEST_RATE, "rad/s"),
         ("accel_S", accel, HIGHEST_ACCEL, "m/s^2"),
     ):
-        largest = max(values.max(initial=0.0), -values.min(initial=0.0))
+        largest = find_largest(values)
         if not largest < np.inf:  # NaN
             raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
         if largest > most:
             raise BadData(
                 f"{name} has a value of {largest:.6g}: no sensor measures above {most:g} {unit}; check the unit"
             )
-    for fault in find_faults({"": (np.arange(len(gyro)) / rate_hz, gyro, accel)}).get("", []):
-        raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
+    if has_repeats(gyro) or has_repeats(accel):
+        for fault in find_faults({"": (np.arange(len(gyro)) / rate_hz, gyro, accel)}).get("", []):
+            raise BadData(
+                f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out"
+            )
     noise: SensorNoise = TYPICAL
     start = None
     diagnostics: tuple[Diagnostic, ...] = ()

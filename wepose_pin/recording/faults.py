@@ -113,7 +113,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     faults: dict[str, list[Fault]] = {}
     for name, (time, *values) in samples.items():
         gyro_S, accel_S = map(np.ascontiguousarray, values)
-        if not (_repeats(gyro_S) or _repeats(accel_S)):
+        if not (has_repeats(gyro_S) or has_repeats(accel_S)):
             continue
         covered = np.zeros(len(time), dtype=bool)
         of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
@@ -161,7 +161,7 @@ def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _repeats(values):  # type: ignore[no-untyped-def]
+def has_repeats(values):  # type: ignore[no-untyped-def]
     """Return whether `FROZEN_SAMPLES` rows in a row have the same values, by one pair of so many."""
     for row in range(1, len(values), FROZEN_SAMPLES - 1):
         if is_same(values[row - 1], values[row]):
@@ -228,8 +228,7 @@ def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
 def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
     """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
     state, values = start_saturation(), np.ascontiguousarray(values)
-    largest = max(values.max(initial=0.0), -values.min(initial=0.0))
-    if _may_saturate(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * largest)):
+    if _may_saturate(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * find_largest(values))):
         _watch_all(state, values, least)
     return np.asarray(state["level"][0])
 
@@ -239,6 +238,19 @@ def start_saturation() -> np.ndarray:
     state = np.zeros(1, SATURATION)
     state["digit"] = state["level"] = np.inf
     return state
+
+
+@kernel
+def find_largest(values):  # type: ignore[no-untyped-def]
+    """Return the largest magnitude of values (n, 3), contiguous; NaN where one is no number."""
+    largest = 0.0
+    for row in range(len(values)):
+        x, y, z = abs(values[row, 0]), abs(values[row, 1]), abs(values[row, 2])
+        if not (x <= largest and y <= largest and z <= largest):  # few rows: a single pass at the speed of memory
+            if np.isnan(x + y + z):
+                return np.nan
+            largest = max(largest, x, y, z)
+    return largest
 
 
 @kernel
