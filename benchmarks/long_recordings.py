@@ -14,13 +14,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from wepose_pin.body import load_model
-from wepose_pin.calibration import calibrate
 from wepose_pin.errors import NoSolution
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
-from wepose_pin.writers.result import write_subject
 
 from .tables import Column, Section, Table
 
@@ -37,10 +34,7 @@ def measure_long_recordings(hours: tuple[float, ...]) -> Table:
     table = Table(
         "Long recordings: five sensors at 100 Hz, wepose track",
         (
-            Column("read", "read [MB]", 0),
-            Column("written", "written [MB]", 0),
             Column("seconds", "time [s]", 0),
-            Column("faster", "times real time", 0),
             Column("memory", "memory [MB]", 0),
         ),
     )
@@ -54,13 +48,8 @@ def measure_long_recordings(hours: tuple[float, ...]) -> Table:
 
 
 def _write(folder: Path, hours: float) -> None:
-    """A person who stands, joins hands, draws circles and does it all backwards, again and again; calibrated."""
-    person = simulate_person(1)
-    made = simulate(person.lengths, seed=1)
-    recording = made.recording("day")
-    subject = calibrate(
-        recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std
-    ).subject
+    """A person who stands, joins hands, draws circles and does it all backwards, again and again."""
+    recording = simulate(simulate_person(1).lengths, seed=1).recording("day")
     folder.mkdir()
     write_session(folder, there_and_back(recording, recording.span(recording.phases["start"][0])))
     once = pl.scan_parquet(folder / "recording.parquet").drop("time")
@@ -69,8 +58,6 @@ def _write(folder: Path, hours: float) -> None:
     repeated = repeated.with_columns(pl.col("time") / recording.rate_hz)
     repeated.sink_parquet(folder / "repeated.parquet")
     (folder / "repeated.parquet").replace(folder / "recording.parquet")
-    (folder / "subject").mkdir()
-    write_subject(folder / "subject", subject, load_model().with_lengths(dict(subject.lengths)))
 
 
 def there_and_back(recording: Recording, rest: slice) -> Recording:
@@ -93,18 +80,14 @@ def _track(folder: Path, hours: float) -> dict[str, float]:
     """Track in a process of its own, and return what that costs; `NoSolution`: it fails."""
     session = folder / f"{hours:g}"
     argv = [sys.executable, "-m", "wepose_pin", "track", str(session), "-o", str(folder / "out"), "--force"]
-    argv += ["--subject", str(session / "subject"), "--no-report"]
+    argv.append("--no-report")
     begin = time.perf_counter()
     process = subprocess.Popen(argv, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise NoSolution(f"wepose track of {hours:g} h ended with {process.returncode}")
-    seconds = time.perf_counter() - begin
     return {
-        "read": (session / "recording.parquet").stat().st_size / 1e6,
-        "written": (folder / "out" / "pose.parquet").stat().st_size / 1e6,
-        "seconds": seconds,
-        "faster": 3600.0 * hours / seconds,
+        "seconds": time.perf_counter() - begin,
         "memory": used.ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6,
     }
