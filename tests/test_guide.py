@@ -288,14 +288,29 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     session.guide.close()
 
 
-def test_more_motion_is_of_the_longest_part_of_a_joined_protocol(tmp_path: Path) -> None:
+def test_more_motion_is_of_the_longest_part_of_a_joined_protocol_and_a_pose_is_repeated(tmp_path: Path) -> None:
     session = Session(tmp_path, protocol="clasp+t_pose")
     guide = session.guide
     session.run(lambda m: bool(m.view.quality))
     assert set(guide.attempt.make_recording().phases) == {"start", "clasp", "t_pose"}
     guide.ask(Request("more"))
     assert guide.step.name == "clasp"
+    session.run(lambda m: m.step == "quality")
+    assert set(guide.attempt.list_phases()) == {"start", "clasp", "t_pose"}
+    guide.ask(Request("t_pose"))  # the pose is held anew
+    assert set(guide.attempt.list_phases()) == {"start", "clasp"}
     guide.close()
+
+
+def test_a_full_disk_is_said_and_the_next_start_pose_begins_a_new_file(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    begin(session, "clasp", 1.0)
+    session.guide.attempt.log.problem = "calibration-1.mcap: the recording ended: No space left on device"
+    assert session.run(lambda m: bool(m.view.note))[-1].view.note.endswith("No space left on device")
+    session.guide.ask(Request("restart"))
+    assert session.guide.view().note == ""
+    assert session.guide.attempt.log.path.name == "calibration-2.mcap"
+    session.guide.close()
 
 
 @pytest.mark.parametrize(

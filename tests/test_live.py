@@ -145,6 +145,15 @@ def test_an_accelerometer_in_g_is_not_tracked_and_nothing_is_recorded(recording:
     assert "sensors.torso.accel: norm 1" in watcher.statuses[-1].message
 
 
+def test_who_walks_to_the_start_pose_is_not_told_to_have_moved(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live.LiveLoop, "STATUS_PERIOD_S", 0.0)
+    watcher = Watcher()
+    run(replace(recording.cut(slice(1000, 1500)), phases={}), tmp_path / "a", watcher=watcher)
+    assert {status.state for status in watcher.statuses} == {"start_pose", "ended"}
+
+
 @pytest.mark.parametrize("where", ["worn", "table"])
 def test_rates_in_deg_s_are_said_while_the_person_waits(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str

@@ -27,6 +27,7 @@ from ..body.configuration import KinematicsSolver
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
+from ..documents import whole_file
 from ..errors import BadOption
 from ..filters import BEST
 from ..readers import load_session
@@ -231,7 +232,8 @@ class Guide(Stage):
         folder = self.options.folder
         for name in SUBJECT_FILES:
             if (result / name).is_file():
-                shutil.copyfile(result / name, folder / name)
+                with whole_file(folder / name, force=True) as file:
+                    shutil.copyfile(result / name, file)
         write_segments(folder, self.segments)
         self.accepted, self.is_over = calibration, True
 
@@ -243,7 +245,8 @@ class Guide(Stage):
     def view(self) -> GuideView:
         states = ["done"] * self._index + ["now"] + ["ahead"] * (len(self.steps) - self._index - 1)
         steps = tuple(GuideStep(step.name, step.title, state) for step, state in zip(self.steps, states, strict=True))
-        return self._view._replace(steps=steps)
+        problem = "" if self.attempt is None else self.attempt.log.problem
+        return self._view._replace(note=self._view.note or problem, steps=steps)
 
     def build_status(self) -> Status:
         sensors = []

@@ -16,7 +16,7 @@ from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.result import format_longest
 from ..diagnostics import join_text, render, render_all
-from ..errors import BadData, WeposeError
+from ..errors import BadData, BadOption, ExistingOutput, WeposeError
 from ..recording import check_recording
 from ..recording.arrivals import unpack_orientations
 from ..tracking.start_pose import StartPoseDetector
@@ -69,10 +69,11 @@ def run_guide(
     Returns the source and the setup to track with. The source, not open before, stays open then, the outputs always.
     """
     options.joined.check_body(options.model.table)
+    steps = make_steps(options.joined)
     threading.Thread(target=warm_up, args=(options.method,), daemon=True).start()  # tracking begins without a wait
     if not open_and_wait(source, outputs, should_stop):
         return None
-    guide = Guide(source, options, make_steps(options.joined), outputs)
+    guide = Guide(source, options, steps, outputs)
     if guide.run(should_stop) is None:
         source.close()
         return None
@@ -83,6 +84,8 @@ def run_guide(
 def make_steps(protocol: Protocol) -> list[Step]:
     """The table of steps of a guided session with the motions of this protocol."""
     motions = [step for step in protocol.steps if step.phase != "start"]
+    if not motions:
+        raise BadOption(f"--protocol {protocol.name}: has no motion that --guide could lead through; name another one")
     return [
         Step("sensors", "Sensors", find_sensors, before_attempt=True),
         Step("assignment", "Segments", assign_segments, before_attempt=True),
@@ -165,6 +168,8 @@ def measure_shakes(guide: Guide) -> dict[str, float]:
 
 def hold_start_pose(guide: Guide, _: bool) -> StepRun:
     """Wait until the person is ready, then until the start pose was held in right units; the motions begin anew."""
+    if guide.attempt is not None and guide.attempt.log.problem:  # the file has ended: into a new one
+        guide.close()
     attempt, protocol = guide.begin_attempt(), guide.options.joined
     reason, guide.reason = guide.reason, ""
     starts = [(step.seconds, step.do) for step in protocol.steps if step.phase == "start"]
@@ -208,8 +213,10 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
 def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepRun:
     """Record a phase of the protocol; the person sees what it has determined. A lost sensor needs the start pose."""
     attempt, phase, target_s = guide.begin_attempt(), motion.phase, motion.seconds
-    if asked_for:
+    if asked_for and motion is find_longest(guide.options.joined):
         target_s = max(target_s, measure_phase(attempt, phase) + min(MORE_S, target_s))
+    elif asked_for:  # a pose that was another one
+        attempt.mark("discard", phase=phase)
     begin, running = guide.now + GET_READY_S, False
     estimate: Calibration | None = None  # of the motion so far
     future: Future[Calibration] | None = None  # the next one
@@ -248,6 +255,11 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
             attempt.mark("end", phase=phase, time=attempt.newest)
 
 
+def find_longest(protocol: Protocol) -> ProtocolStep:
+    """The motion of which more may be wanted."""
+    return max((step for step in protocol.steps if step.phase != "start"), key=lambda step: step.seconds)
+
+
 def measure_phase(attempt: Recorder, phase: str) -> float:
     """Duration [s] of a phase so far."""
     return sum(last - first for first, last in attempt.list_phases().get(phase, ()))
@@ -271,10 +283,10 @@ def _add_estimate(view: GuideView, calibration: Calibration, running: bool) -> G
     """The view with what the motion has determined so far, and what to do while the person moves."""
     view = view._replace(lengths=_list_lengths(calibration))
     if calibration.exchanged:
-        return view._replace(note=view.note or "Some sensors seem to sit on other segments than assigned.")
+        return view._replace(note=view.note or "Some sensors seem to sit on other segments: finish, and see.")
     newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
     if running and np.isfinite(newest).any() and np.nanmedian(newest) > APART:
-        view = view._replace(note="They seem to be apart.")
+        view = view._replace(note=f"{view.sentence.partition('. ')[0]}. They seem to be apart.")
     elif running and calibration.quality.quality == "pass":
         view = view._replace(sentence="This is enough: finish, or go on for smaller uncertainties.")
     # About the parts of the motion that are too small, else the worst reason.
@@ -316,10 +328,12 @@ def show_result(guide: Guide, _: bool) -> StepRun:
         while True:
             asked = yield view._replace(note=note)
             if asked is ACCEPT and calibration is not None:
-                guide.accept(calibration, path.with_suffix(""))
+                try:
+                    guide.accept(calibration, path.with_suffix(""))
+                except ExistingOutput as error:  # such as a full disk: the person may try again
+                    note = str(error)
             elif asked is MORE:
-                motions = [step for step in options.joined.steps if step.phase != "start"]
-                return max(motions, key=lambda step: step.seconds).phase
+                return find_longest(options.joined).phase
             elif asked is RESTART:
                 return "start"
             elif asked is not None and asked.name == MEASURE.name:

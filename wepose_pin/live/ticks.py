@@ -29,6 +29,7 @@ SILENT_STEP_S = 0.25  # [s] a longer step is a silence
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate of the ticks is measured if the source does not know it
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
+BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
 
 
 def measure_step(time_s: np.ndarray) -> float:
@@ -200,6 +201,7 @@ class StartPoseSearch:
     def __init__(self, stream: Recorder, setup: SensorSetup, table: BodyTable) -> None:
         self._stream, self._pose = stream, stream.detect_start_pose()
         self._stated = next(iter(setup.phases.get("start", ())), None)
+        self._longest_s = 0.0  # [s] for which the person stood still
         self._instruction = f"Hold still in the start pose, {setup.start_pose}"
         if table.is_mechanism:
             self._instruction = f"{table.name} must stand still in its start configuration"
@@ -235,10 +237,13 @@ class StartPoseSearch:
         if pose.state == "waiting":
             return "waiting", frozen or f"Waiting for {join_names([sensors[k] for k in pose.missing])}.", 0.0
         progress = min(1.0, pose.held_s / START_POSE_HOLD_S)
+        self._longest_s = max(self._longest_s, pose.held_s)
         if wrong_unit:
             return "moved", wrong_unit, progress
         if pose.state != "moved":
             left_s = max(0.0, START_POSE_HOLD_S - pose.held_s)
             return "start_pose", f"{self._instruction}: {left_s:.0f} s more.", progress
+        if self._longest_s < BEGUN_S:  # the person walks to the place, or takes the pose
+            return "start_pose", f"{self._instruction}.", 0.0
         moved, again = join_names([sensors[k] for k in pose.moving]), self._instruction
         return "moved", f"You moved ({moved}). Once more: {again[0].lower()}{again[1:]}.", progress
