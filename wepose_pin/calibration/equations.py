@@ -286,7 +286,7 @@ def _build_shape_prior(layout: Layout, prior: Subject, measured: Mapping[str, tu
     covariance = prior.shape_covariance(table)[np.ix_(rows, rows)]
     covariance[count:, count:] += LEAST_GIRDLE_STD**2 * np.eye(len(covariance) - count)
     if not set(layout.lengths) <= set(prior.order) or np.any(np.linalg.eigvalsh(covariance) <= 0.0):
-        raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
+        raise BadSubject(f"prior '{prior.name}': all its lengths need a covariance, and it must be positive definite")
     K = np.linalg.inv(covariance)
     target = K @ np.concatenate(([prior.lengths[name] for name in layout.lengths], *own))
     for name, (metres, std) in measured.items():

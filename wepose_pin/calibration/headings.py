@@ -205,7 +205,7 @@ def _turn_by_hinges(fit: LeastSquares, headings: np.ndarray) -> float:
     return -float(np.angle(bent)) if bent else 0.0
 
 
-# Couplings
+# Couplings ------------------------------------------------------------------------------------------------------------
 
 
 def estimate_couplings(

@@ -128,7 +128,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
         )
     names, prior, groups = problem.layout.lengths, problem.prior, problem.layout.length_groups.values()
     if np.any(np.linalg.eigvalsh(prior.lengths_covariance(names)) <= 0.0):
-        raise BadSubject(f"prior '{prior.name}': its lengths need a covariance that is positive definite, all of them")
+        raise BadSubject(f"prior '{prior.name}': all its lengths need a covariance, and it must be positive definite")
     if not any(set(group) <= set(problem.measured) for group in groups):
         single = [group[0] for group in groups if len(group) == 1]
         raise BadOption(

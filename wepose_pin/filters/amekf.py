@@ -333,7 +333,7 @@ def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-unty
 
 @kernel
 def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
-    """Filter samples as `OrientationFilter.run`; of each block that ends fill one of `blocks`, while there are any."""
+    """Filter samples as `OrientationFilter.run`; fill one of `blocks` at the end of each block, while any are left."""
     state, model = states[0], models[0]
     P, row = state.P, 0
     for k in range(len(gyro_S)):

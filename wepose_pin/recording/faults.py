@@ -56,7 +56,7 @@ class Fault(NamedTuple):
 
     def describe(self, since: float) -> str:
         """Describe the fault from the time [s] `since` on."""
-        value = ", ".join(f"{v:.4g}" for v in self.value)
+        value = ", ".join(f"{v + 0.0:.4g}" for v in self.value)
         unit = "m/s^2" if self.signals == ACCEL else "rad/s"
         stands = "stand still, gyro" if self.signals == BOTH else "stands still"
         return f"{self.signals} {stands} at {value} {unit} from {format_time(since)} to {format_time(self.last)} s"

@@ -119,7 +119,8 @@ class Recording:
             Segment → axes of its sensor that point up and forwards in the N-pose, such as ("+z", "+x"); not needed with
             the subject of a calibration.
         **sensors
-            Segment → (gyro_S, accel_S), (n, 3) [rad/s] and (n, 3) [m/s²], or quat_VS, (n, 4) xyzw.
+            Segment → (gyro_S, accel_S), (n, 3) [rad/s] and (n, 3) [m/s²], or quat_VS, (n, 4) xyzw. Fill or cut gaps
+            first.
 
         Raises
         ------
@@ -134,6 +135,7 @@ class Recording:
         {'torso': ImuSensor(2250 samples)}
         """
         check_value("rate_hz", rate_hz, Positive)
+        check_value("mounts", mounts or {}, Mapping[str, tuple[str, str]])
         built: dict[str, Sensor] = {}
         count = 0
         for segment, values in sensors.items():
@@ -147,7 +149,7 @@ class Recording:
                 built[segment] = ImuSensor(*values, mount)
             else:
                 raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
-            count = count or len(values[0] if isinstance(values, tuple) else values)
+            count = count or len(np.atleast_1d(values[0] if isinstance(values, tuple) else values))
         return cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check()
 
     def check(self) -> Recording:
