@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-import struct
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -23,15 +22,14 @@ STAND = 60, 440  # samples of the simulation in which the person stands
 RETURN_FASTER = 12  # times, back to the start pose: samples in between are left out
 SHAKE_HZ, SHAKE_RATE = 3.0, 8.0  # amplitude in rad/s
 NAMES = ("a7", "b2", "c9", "d4", "e5")
-TRACKERS = tuple(f"4c:11:ae:00:00:a{k}/0" for k in range(5))
 
 
 @lru_cache(maxsize=4)
-def perform(seed: int = 3, clasp_s: float = 100.0, mount: str = "any", protocol: str = "clasp") -> Simulation:
+def perform(seed: int, clasp_s: float) -> Simulation:
     """A person whose clasp lasts longer than the guide asks for."""
     lengths = simulate_person(seed).lengths
-    imperfections = replace(MILD_PRESET, mount=mount, dropped=0.0)
-    return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0, protocol=protocol)
+    imperfections = replace(MILD_PRESET, mount="any", dropped=0.0)
+    return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0)
 
 
 class GuidedPerson:
@@ -39,9 +37,8 @@ class GuidedPerson:
 
     Attributes
     ----------
-    doing : "stand", "clasp", "await bow", "bow", or "shake SEGMENT"
+    doing : "stand", "clasp", or "shake SEGMENT"
     silent : segments whose sensors send nothing
-    hurries : returns to the start pose faster than the motion went
     worn : sensor → segment that it sits on
     orientations : what sensors measure in place of rates and specific forces: "sensor" or "segment" orientations
     """
@@ -49,16 +46,14 @@ class GuidedPerson:
     def __init__(self, simulation: Simulation, worn: Mapping[str, str] | None = None, orientations: str = "") -> None:
         self.simulation, self.orientations = simulation, orientations
         self.worn = dict(zip(NAMES, simulation.gyro_S, strict=True)) if worn is None else dict(worn)
-        self.doing, self.silent, self.hurries = "stand", set[str](), True
+        self.doing, self.silent = "stand", set[str]()
         self.disturb: Callable[[str, np.ndarray], np.ndarray] = lambda _segment, gyro: gyro
         self._k, self._direction, self._sent = STAND[0], 1, 0
 
-    def follow(self, step: str, highlight: str, countdown: float | None) -> None:
+    def follow(self, step: str, highlight: str) -> None:
         """Do what the guide's view says."""
         shakes = step == "assignment" and highlight
         self.doing = f"shake {highlight}" if shakes else "clasp" if step in ("clasp", "quality") else "stand"
-        if step == "bow":
-            self.doing = "bow" if countdown is None else "await bow"
 
     def step(self) -> tuple[float, dict[str, tuple[np.ndarray, np.ndarray]]]:
         """Time [s] of the next sample, and sensor → gyro (3,) and accel (3,)."""
@@ -69,10 +64,8 @@ class GuidedPerson:
             self._direction = -1
         elif self._k <= STAND[0]:
             self._direction = 1
-        returns = self.hurries and self._direction < 0 and self._k > STAND[1] + RETURN_FASTER
+        returns = self._direction < 0 and self._k > STAND[1] + RETURN_FASTER
         self._k += self._direction * (RETURN_FASTER if returns else 1)
-        if self.doing.endswith("bow"):
-            self._k = self._go_to_bow(before)
         row = max(before, self._k)  # the rate over the interval between the two
         self._sent += 1
         time_s = self._sent / RATE_HZ
@@ -94,13 +87,6 @@ class GuidedPerson:
             else:
                 samples[sensor] = gyro, accel
         return time_s, samples
-
-    def _go_to_bow(self, row: int) -> int:
-        """The row after this one: quickly to the bow, which waits until it is asked for, then through it."""
-        begin, end = np.searchsorted(self.simulation.time, self.simulation.phases["bow"][0]).tolist()
-        if row < begin or row >= end:
-            return max(row, min(row + RETURN_FASTER, begin))
-        return row + 1 if self.doing == "bow" else row
 
     def _orient(self, segment: str, time_s: float) -> np.ndarray:
         """Orientation (4,) xyzw of a segment in W, or of its sensor in a world of its own; a shake turns it."""
@@ -156,7 +142,7 @@ class UdpPerson:
     """Sends the person's samples in real time, as JSON, from a thread of its own."""
 
     def __init__(self, person: GuidedPerson, port: int) -> None:
-        self.person, self._to, self.asleep = person, ("127.0.0.1", port), False
+        self.person, self._to = person, ("127.0.0.1", port)
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -169,43 +155,14 @@ class UdpPerson:
         self._thread.join()
 
     def _run(self) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as self._socket:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             begin, sent = time.monotonic(), 0
             while not self._end.is_set():
                 time.sleep(max(0.0, begin + sent / RATE_HZ - time.monotonic()))
                 t, samples = self.person.step()
                 sent += 1
-                if not self.asleep:
-                    self._send(t, samples)
-
-    def _send(self, t: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-        lines = [
-            json.dumps({"sensor": sensor, "t": t, "gyro": gyro.tolist(), "accel": accel.tolist()})
-            for sensor, (gyro, accel) in samples.items()
-        ]
-        self._socket.sendto("\n".join(lines).encode(), self._to)
-
-
-class TrackerPerson(UdpPerson):
-    """SlimeVR trackers that state no place, each from an address of its own, as their protocol's description has it."""
-
-    def __enter__(self) -> UdpPerson:
-        self._numbers = dict.fromkeys(self.person.worn, 0)
-        self._sockets = {name: socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for name in self.person.worn}
-        return super().__enter__()
-
-    def __exit__(self, *_: object) -> None:
-        super().__exit__()
-        for each in self._sockets.values():
-            each.close()
-
-    def _send(self, t: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-        del t
-        for name, numbers in samples.items():
-            if self._numbers[name] % 300 == 0:  # it looks for a server, and says who it is
-                mac = bytes.fromhex(name.partition("/")[0].replace(":", ""))
-                hello = struct.pack(">IQ7I", 3, 0, *(0,) * 7) + b"\x05v0.6." + mac + b"\0"
-                self._sockets[name].sendto(hello, self._to)
-            self._numbers[name] += 1
-            quat = [*numbers[0], numbers[1][0]]
-            self._sockets[name].sendto(struct.pack(">IQBB4fB", 17, self._numbers[name], 0, 1, *quat, 0), self._to)
+                lines = [
+                    json.dumps({"sensor": sensor, "t": t, "gyro": gyro.tolist(), "accel": accel.tolist()})
+                    for sensor, (gyro, accel) in samples.items()
+                ]
+                sender.sendto("\n".join(lines).encode(), self._to)

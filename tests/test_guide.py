@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import re
-import select
-import socket
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from arms import write_arm
 from commands import run
-from guided_person import TRACKERS, GuidedPerson, PersonSource, TrackerPerson, perform
+from guided_person import GuidedPerson, PersonSource, perform
 from sampling import find_free_port
 
 import wepose_pin as wp
 from wepose_pin import Calibration, Recording, calibrate, load_model, load_session, simulate_person
-from wepose_pin.commands.live import live
-from wepose_pin.live import Output, Request, SensorSetup, Status
+from wepose_pin.live import Request, SensorSetup
 from wepose_pin.live.guide import Guide, GuideOptions
 from wepose_pin.live.steps import make_steps, measure_phase
 from wepose_pin.readers.live_log import read_live_log
@@ -92,7 +86,7 @@ class Session:
             guide.process(self.source.read(0.1))
             guide.build_status()  # as the loop does
             view, step = guide.view(), guide.step.name
-            self.person.follow(step, self.obeys(step, view), view.countdown)
+            self.person.follow(step, self.obeys(step, view))
             yield Moment(self.source.clock(), step, view)
             first = view.actions[0].name if view.actions else ""
             if (step, first) in PRESSED:
@@ -329,74 +323,3 @@ def test_a_setup_with_a_wrong_segment_is_refused(
     assert run("live", "--source", source, "--guide", "--setup", tmp_path, "-o", tmp_path / "o", "--no-page") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
-
-
-class Follower(Output):
-    """A person in front of a terminal, who reads what is said and presses what is offered first."""
-
-    def __init__(self, person: GuidedPerson) -> None:
-        self.person = person
-        self.newest: Status | None = None
-        self.steps: list[str] = []
-        self._requests: list[Request] = []
-
-    def status(self, status: Status) -> None:
-        self.newest, guide = status, status.guide
-        if guide is None:
-            self.person.follow("", "", None)
-            return
-        step = next(step.name for step in guide.steps if step.state == "now")
-        self.person.follow(step, guide.highlight, guide.countdown)
-        if step not in self.steps:
-            self.steps.append(step)
-        if guide.actions and (step, guide.actions[0].name) in PRESSED:
-            self._requests = [Request(guide.actions[0].name)]
-
-    def take_requests(self) -> list[Request]:
-        requests, self._requests = self._requests, []
-        return requests
-
-
-@pytest.mark.slow
-def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None:
-    """The command as a person without a screen runs it: trackers of no stated place and mount, a robot's arm."""
-    simulation = perform(*PERSON, protocol="clasp+bow")
-    protocol = CLASP.read_text(encoding="utf-8")
-    (tmp_path / "short.toml").write_text(protocol.replace("seconds = 60", "seconds = 24"), encoding="utf-8")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        port, to = find_free_port(), receiver.getsockname()[1]
-        person = GuidedPerson(simulation, dict(zip(TRACKERS, simulation.gyro_S, strict=True)), "sensor")
-        view, states = Follower(person), set[str]()
-
-        def stop() -> bool:
-            while select.select([receiver], [], [], 0.0)[0]:
-                states.add(json.loads(receiver.recv(65535))["state"])
-            if "follow" in states:
-                return True
-            if view.newest is not None and view.newest.state == "ready":
-                person.follow("clasp", "", None)  # the arms move
-            return False
-
-        robot = tmp_path / "follow.toml"
-        robot.write_text(f'robot = "{write_arm(tmp_path).name}"\narm = "right"\nto = {to}\n', encoding="utf-8")
-        with TrackerPerson(person, port):
-            outcome = live(
-                source=f"slimevr:{port}",
-                guide=True,
-                out=tmp_path / "anna",
-                protocol=f"{tmp_path / 'short.toml'}+bow",
-                measured=MEASURED,
-                page=False,
-                robot=str(robot),
-                views=[view],
-                until=stop,
-            )
-    assert view.steps == ["sensors", "assignment", "start", "clasp", "bow", "quality"]
-    assert tomllib.loads((tmp_path / "anna" / "setup.toml").read_text())["sensors"] == person.worn
-    assert {"hold", "approach", "follow"} <= states
-    assert outcome.session is not None
-    assert outcome.session.poses
-    subject = wp.load_subject(tmp_path / "anna")
-    for name, length in simulation.lengths.items():
-        assert abs(subject.lengths[name] - length) < 3.0 * subject.std(name), name

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from arms import write_arm
 from browser import BROWSER, Browser
 from guided_person import GuidedPerson, UdpPerson, perform
+from sampling import find_free_port
 
 from wepose_pin import calibrate, load_session, load_subject, simulate_person
 
@@ -50,7 +52,7 @@ class Reader:
         step, says = said["step"], said["says"]
         shaken = says.removeprefix("Shake the sensor on the ").rstrip(".").replace(" ", "_")
         names = {"Segments": "assignment", "Clasp": "clasp", "Result": "quality"}
-        self.person.follow(names.get(step, ""), shaken, None)
+        self.person.follow(names.get(step, ""), shaken)
         if step and step not in self.steps:
             self.steps.append(step)
         return said
@@ -78,14 +80,16 @@ class Reader:
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
+    pytest.importorskip("daqp")
     protocol = (ROOT / "calibration" / "clasp.toml").read_text(encoding="utf-8")
     (tmp_path / "short.toml").write_text(protocol.replace("seconds = 60", "seconds = 24"), encoding="utf-8")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    receiver, port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), find_free_port()
+    receiver.bind(("127.0.0.1", 0))
+    follow = f'robot = "{write_arm(tmp_path).name}"\narm = "right"\nto = {receiver.getsockname()[1]}\n'
+    (tmp_path / "follow.toml").write_text(follow, encoding="utf-8")
     measured = f"shoulder_width={LENGTHS['shoulder_width']}"
     command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"udp:{port}", "--guide", "-o", "anna"]
-    command += ["--no-open", "--protocol", "short.toml", "--measured", measured]
+    command += ["--no-open", "--protocol", "short.toml", "--measured", measured, "--robot", "follow.toml"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     run = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
@@ -108,6 +112,9 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
             assert reader.until("Clasp")["actions"]
             reader.until("Result")
             reader.until(state="ready")
+            receiver.settimeout(60.0)
+            while json.loads(receiver.recv(65535))["state"] == "hold":  # the robot, until it has a pose
+                pass
             assert reader.steps == STEPS
             assert reader.clicks == ["next", "next", "accept"]
             moments = [time.monotonic()]
@@ -119,6 +126,7 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
             assert browser.errors == []
     finally:
         browser.close()
+        receiver.close()
         run.terminate()
         out, err = run.communicate(timeout=180)
     assert run.returncode == 0, err
