@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -140,13 +138,6 @@ def test_a_byte_order_mark_and_dos_lines(name: str, tmp_path: Path) -> None:
         assert try_one(BY_NAME[name], tmp_path, b"\xef\xbb\xbf" + seed.replace(b"\n", b"\r\n")) is None
 
 
-@pytest.fixture
-def session(tmp_path: Path) -> Path:
-    files = Files(tmp_path / "in", good_table())
-    files.folder.mkdir()
-    return files.write()
-
-
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no /dev/zero here")
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".h5", ".mvnx", ".txt", ".sto", ".mcap", ".toml"])
 def test_a_device_without_end_is_no_file(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,13 +147,3 @@ def test_a_device_without_end_is_no_file(suffix: str, tmp_path: Path, capsys: py
         named = tmp_path / "session.toml"
         named.write_text(SESSION.replace("arm.csv", f"a{suffix}"))
     assert "a" + suffix in refused(["track", str(named), "-o", str(tmp_path / "out")], capsys)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_a_full_disk_under_stdout(tmp_path: Path, session: Path) -> None:
-    command = [sys.executable, "-m", "wepose_pin", "track", str(session), "-o", str(tmp_path / "out")]
-    with open("/dev/full", "w") as full:
-        run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
-    assert run.returncode == 2
-    assert run.stderr.splitlines()[-1].endswith("No space left on device; " + f"{tmp_path / 'out'} was written before")
-    assert (tmp_path / "out" / "pose.parquet").is_file()

@@ -15,7 +15,7 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
-from wepose_pin import Imperfections, ImuNoise, WeposeError
+from wepose_pin import ImuNoise, WeposeError
 from wepose_pin.filters import AmekfParams
 
 NAN, INF = float("nan"), float("inf")
@@ -214,8 +214,6 @@ def test_every_wrong_call_is_refused_and_says_what_is_wrong(function: str) -> No
         *((lambda value=value: wp.StaticTest(window_s=value), "window_s") for value in POSITIVE),
         (lambda: wp.StaticTest(alpha=-1.0), "alpha"),
         (lambda: AmekfParams(block_s="100"), "block_s"),
-        (lambda: Imperfections(tissue_gain=-1.0), "tissue_gain"),
-        (lambda: Imperfections(mount="nonsense"), "mount"),
         (lambda: wp.simulate(**right()["simulate"], noise=ImuNoise(gyro_density=NAN)), "gyro_density"),
     ],
 )
