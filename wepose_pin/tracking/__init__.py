@@ -56,8 +56,8 @@ def track(
     recording : Recording
         As `load_session` reads it, or built in code.
     subject : Subject or Calibration, optional
-        Use the lengths and mounts of this person. Without it lengths are those of the population prior, or of a chosen
-        model its own, and mounts those that the session states.
+        Use the lengths and mounts of this person. Without it the lengths are those of the population prior, or of the
+        chosen model, and the mounts those that the session states.
     method : str
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
         and backward in time, not live), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases,
