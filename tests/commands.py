@@ -20,6 +20,4 @@ def run(*words: object) -> int:
 def options(name: str) -> dict[str, inspect.Parameter]:
     """Name → parameter of what a command takes besides words by position."""
     parameters = inspect.signature(APP[name].default_command).parameters.values()
-    return {
-        each.name: each for each in parameters if each.kind is each.KEYWORD_ONLY and "UNSEEN" not in each.annotation
-    }
+    return {each.name: each for each in parameters if each.kind is each.KEYWORD_ONLY}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from cyclopts import Group, Parameter
 
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
     from ..live.sources.base import Source
 
 GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
-UNSEEN = Parameter(parse=False)
 
 
 class Live(NamedTuple):
@@ -83,8 +81,6 @@ def live(
     speed: Annotated[Speed, MORE] = "1",
     accept_failed: Annotated[bool, MORE] = False,
     method: Annotated[LiveMethod, RESEARCH] = "amekf",
-    views: Annotated[Sequence[Any] | None, UNSEEN] = None,
-    until: Annotated[Callable[[], bool] | None, UNSEEN] = None,
 ) -> Live:
     """Track a person live: show the pose in the browser and the terminal, send it to programs or a robot, record it.
 
@@ -147,10 +143,6 @@ def live(
     speed
         With --source replay: replay at this speed; 1 is that of the recording, 4 is four times that, max is as fast as
         possible.
-    views
-        Outputs that show the pose and the state; None: the terminal.
-    until
-        Returns True to end the session; None: Ctrl-C ends it.
     """
     from ..body.subject import load_subject
     from ..calibration import load_protocol
@@ -185,13 +177,13 @@ def live(
     if not guide:
         check_mounts(samples, worn)  # before the page opens
     print_diagnostics(body.diagnostics)
-    outputs: list[Output] = list(views or [TerminalView(keyboard=Keyboard())])
+    outputs: list[Output] = [TerminalView(keyboard=Keyboard())]
     driven: RobotOutput | None = None
     served = _open_page(body, out.absolute().name if out is not None else worn.name, host, port, open) if page else None
     if served is not None:
         outputs.insert(0, served)
     try:
-        with contextlib.nullcontext(until) if until is not None else stop_requests() as should_stop:
+        with stop_requests() as should_stop:
             if guide:
                 folder = _make_guide_folder(out, force)
                 options = GuideOptions(
