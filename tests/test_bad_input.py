@@ -108,7 +108,7 @@ SAYS = [
     ('accel = ["ax", "ay", "az"]\n', "", "sensors.torso.accel is missing"),
     ('["gx", "gy", "gz"]', '["gx", "gy"]', "gyro = ['gx', 'gy']; a list of 3 different column names is needed"),
     ('time = "time"', "rate_hz = -100.0", "data.rate_hz = -100.0; a number from"),
-    ('time = "time"', 'time = "time"\nrate_hz = 100', "one of the two, and both is"),
+    ('time = "time"', 'time = "time"\nrate_hz = 100', "one of the two, and both are"),
     ('time = "time"\n', "", "one of the two, and neither is there"),
     (
         'time = "time"',

@@ -326,7 +326,7 @@ def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sen
     """Read the columns or arrays of a sensor, which the session names."""
     path, table = keys.path, keys.table
     if bool(keys.time) == (keys.rate_hz is not None):
-        stated = "both is" if keys.time else "neither is"
+        stated = "both are" if keys.time else "neither is"
         raise BadSession(f"{keys.at('time')} or rate_hz is needed, one of the two, and {stated} there")
     units = {"orientation": 1.0}
     for signal, unit, known in (("gyro", keys.gyro_unit, GYRO_UNITS), ("accel", keys.accel_unit, ACCEL_UNITS)):
