@@ -119,7 +119,7 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
     if left_out > MAX_LEFT_OUT * len(spans) or np.count_nonzero(alike) < MIN_REPETITIONS:
         return none._replace(reason=f"{left_out} of its {len(spans)} excursions are unlike the others")
     if cmc < MIN_CMC:
-        reason = f"its {len(spans)} excursions are not alike: their CMC is {cmc:.2f}, and {MIN_CMC} is needed"
+        reason = f"its {len(spans)} excursions are not alike: their CMC is {cmc:.3f}, and {MIN_CMC} is needed"
         return none._replace(reason=reason)
     return none._replace(spans=spans[alike])
 
