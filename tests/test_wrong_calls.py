@@ -166,6 +166,7 @@ def wrong_subjects(subject: wp.Subject) -> Iterator[tuple[str, wp.Subject]]:
     yield "order", replace(subject, order=("nonsense", *subject.order[1:]))
     for mounts in (None, {"torso": 2.0 * good}, {"torso": np.zeros(3)}, {"arm": good}):
         yield "mounts", replace(subject, mounts=mounts)
+    yield "heading_drift", replace(subject, heading_drift={"torso": np.array([0.0, -1.0])})
 
 
 def wrong_poses(pose: Any) -> Iterator[tuple[str, Any]]:

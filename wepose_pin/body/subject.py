@@ -154,6 +154,8 @@ class Subject:
             for name, (values, size) in arrays.items():
                 unit = 1e-3 if name.startswith(("mounts", "hinges")) else np.inf
                 check_numbers(f"{where}{name}", values, (size,), unit=unit)
+                if name.startswith(("start_pose_offset", "heading_drift")) and values[-1] < 0.0:
+                    raise BadData(f"{where}{name}[{size - 1}] = {values[-1]:g}: a standard deviation is at least 0")
         except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
         return self
