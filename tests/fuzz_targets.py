@@ -316,6 +316,10 @@ TARGETS = (
     Target(
         "summary",
         lambda: [SUMMARY],
-        file("summary.json", read_summary, lambda: {"pose.parquet": as_parquet(pose())} | urdf("subject.urdf")),
+        file(
+            "summary.json",
+            read_summary,
+            lambda: {"pose.parquet": as_parquet(pose()), "subject.toml": subject()} | urdf("subject.urdf"),
+        ),
     ),
 )
