@@ -2,7 +2,7 @@
 
     minimise  ½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c),   no length below `MIN_LENGTH`
 
-with the prior c, Λ of `build_prior` and the weights w of `weights`.
+with the prior c, Λ of `build_prior` and the weights w of its outer rounds.
 
 For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. Here L is
 the frame of its segment that equals W in the start pose (L' in `observations`). With a start pose that is ε off the

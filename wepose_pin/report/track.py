@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
-from ..angles import AUTO, Angles, joint_angles, summary
+from ..angles import Angles, summary
 from ..body import BodyTable
 from ..body.links import compute_axis_std
-from ..errors import BadData
 from ..recording import format_span
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (
@@ -39,6 +37,7 @@ from .figures import (
     styled,
 )
 from .page import Frame, Item, render_page, show_diagnostics
+from .reliance import compute_angles, describe_reliance, explain_no_covariance, name_tips
 from .viewer import MOST_FRAMES_INSIDE, pose_html
 from .words import Table, kinds, listed, number, plain, plural, spread
 
@@ -54,7 +53,7 @@ def render_track_report(summary: TrackSummary) -> str:
     """
     tracked, measures = summary.tracked, summary
     recording, table = tracked.recording, tracked.model.table
-    angles = _compute_angles(tracked)
+    angles = compute_angles(tracked)
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
     page = pose_html(
         tracked.model,
@@ -73,7 +72,7 @@ def render_track_report(summary: TrackSummary) -> str:
         {
             "What was recorded": _list_recorded(tracked, measures),
             "Drift of the headings": _list_drift(tracked),
-            f"The {_name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
+            f"The {name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
             "The motion in 3D": [Frame(page)],
         },
@@ -81,48 +80,6 @@ def render_track_report(summary: TrackSummary) -> str:
 
 
 # Sections -------------------------------------------------------------------------------------------------------------
-
-
-def _compute_angles(tracked: TrackResult) -> Angles | None:
-    with contextlib.suppress(BadData):  # no joint has both of its segments
-        return joint_angles(tracked.pose, AUTO)
-    return None
-
-
-def describe_reliance(tracked: TrackResult) -> str:
-    """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
-    after_start, table, angles = find_samples_after_start(tracked), tracked.model.table, _compute_angles(tracked)
-    stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
-    for joint, each in angles.joints.items() if angles is not None else ():
-        for k, angle in enumerate(each.names):
-            name = f"{plain(table.shared_name(joint))} {plain(angle)}"
-            known = after_start & ~each.hidden(k)
-            std = np.nan if each.std is None else float(np.degrees(finite_median(each.std[known, k])))
-            if np.isfinite(std):
-                stds[name] = max(std, stds.get(name, 0.0))
-    hinges = [f"{plain(table.shared_name(hinge))} flexion" for hinge in table.hinges]
-    best = next((name for name in stds if name in hinges), min(stds, key=stds.__getitem__, default=None))
-    worst = max(stds, key=stds.__getitem__, default=None)
-    good = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
-    covs, reaches = tracked.pose.point_cov, measure_reach(tracked.pose, table)
-    tips = [finite_median(compute_axis_std(covs[name])[after_start]) for name in reaches if name in covs]
-    if np.isfinite(tips).any():
-        root = "the root" if table.is_mechanism else "the middle of the hips"
-        good.append(f"{_name_tips(table, table.drawn_limbs)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
-    good += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
-    if not good and tracked.pose.segment_cov:  # of a mechanism
-        variances = [np.median(np.diagonal(cov[after_start], 0, 1, 2), 0) for cov in tracked.pose.segment_cov.values()]
-        good = [f"the orientation of each link to ± {np.degrees(np.sqrt(np.max(variances))):.1f}°"]
-    least = f" Least certain: {worst}, ± {stds[worst]:.0f}°." if worst not in (best, None) else ""
-    return f"**Good for** {listed(good)}.{least}" if good else _explain_no_covariance(tracked)
-
-
-def _explain_no_covariance(tracked: TrackResult) -> str:
-    source = f"The filter {tracked.options['method']}" if tracked.recording.imus else "The device"
-    return (
-        f"{source} states no uncertainty: how far angles and positions may be off is not known. The methods "
-        "amekf, smoother, smekf and smekf_published state it."
-    )
 
 
 def _describe_recording(tracked: TrackResult) -> str:
@@ -182,7 +139,7 @@ def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
 def _list_drift(tracked: TrackResult) -> list[Item]:
     stds, _ = compute_heading_stds(tracked)
     if not stds:
-        return [_explain_no_covariance(tracked)]
+        return [explain_no_covariance(tracked)]
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
     text = (
         "Gravity corrects the tilt. No sensor measures the heading, the rotation about the vertical: it is set in the "
@@ -272,7 +229,7 @@ def draw_figures(result: TrackResult) -> Figures:
     figures, table = Figures(), result.model.table
     if len(result.time) > 1:
         figures |= draw_tips(result.time, measure_reach(result.pose, table), table)
-    if (angles := _compute_angles(result)) is not None:
+    if (angles := compute_angles(result)) is not None:
         figures["angles"] = draw_joint_angles(angles)
     return figures
 
@@ -323,13 +280,8 @@ def group_tips(tips: Mapping[str, np.ndarray], table: BodyTable) -> dict[str, di
         base, start = table.drawn_limbs[next(iter(own))].base, plain(table.shared_name(origin[0]))
         start = f"middle of the {plural(start)}" if len(origin) > 1 else start
         frame = f"the {plain(base)}'s own axes" if base else "the axes of W"
-        groups[f"{_name_tips(table, own)}, from the {start} along {frame}"] = own
+        groups[f"{name_tips(table, own)}, from the {start} along {frame}"] = own
     return groups
-
-
-def _name_tips(table: BodyTable, points: Iterable[str]) -> str:
-    """What these points whose path is drawn are on, as "hands"."""
-    return listed(kinds(table, [(table.drawn_limbs[name].segments or (name,))[-1] for name in points]))
 
 
 @styled
