@@ -58,7 +58,7 @@ def batch(
     if failed.height:
         causes = failed.group_by("error", maintain_order=True).agg(pl.len(), pl.first("item"), pl.first("message"))
         for cause, count, item, message in causes.sort("len", descending=True).iter_rows():
-            say(f"Not done: {count} by {cause}, such as {item}: {message}")
+            say(f"Not done: {count} ({cause}), for example {item}: {message}")
     reused = f", {study.reused} of them before" if study.reused else ""
     say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
     say(f"Table: {out.rstrip('/')}/results.parquet")

@@ -283,7 +283,8 @@ def _add_estimate(view: GuideView, calibration: Calibration, running: bool) -> G
     """The view with what the motion has determined so far, and what to do while the person moves."""
     view = view._replace(lengths=_list_lengths(calibration))
     if calibration.exchanged:
-        return view._replace(note=view.note or "Some sensors seem to sit on other segments: finish, and see.")
+        exchanged = "Some sensors seem to sit on other segments. Finish the motion; the result will name them."
+        return view._replace(note=view.note or exchanged)
     newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
     if running and np.isfinite(newest).any() and np.nanmedian(newest) > APART:
         view = view._replace(note=f"{view.sentence.partition('. ')[0]}. They seem to be apart.")
