@@ -25,6 +25,7 @@ residuals: three of its condition and one a hinge; those that do not apply are z
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 
@@ -72,17 +73,6 @@ Gaussian = tuple[np.ndarray, np.ndarray]  # a normal distribution of x: mean (m,
 class Layout:
     """The unknowns of a protocol on a body, each with its places in x (m,); raise as `Protocol.resolve`."""
 
-    length: np.ndarray  # (lengths,) [m]
-    heading: np.ndarray  # (sensors,) ψ [rad]
-    tilt: np.ndarray  # (sensors, 2) ε about x and y of L [rad]
-    drift: np.ndarray  # (sensors,) d [rad/s]
-    hinge: np.ndarray  # (hinges, 2) of its axis along `across` and `tilted`
-    foam: np.ndarray  # (soft, 9) A [rad], column by column
-    twist: np.ndarray  # (twists,) g
-    girdle: np.ndarray  # (girdles, 7) `body.girdle.PARAMETERS`
-    point: np.ndarray  # (fixed points, 3) of W [m]
-    height: np.ndarray  # (planes,) of W [m]
-
     def __init__(self, protocol: Protocol, model: BodyModel, recording: Recording) -> None:
         self.protocol, self.model, table = protocol, model, model.table
         self.start_pose = find_start_pose(model, recording)
@@ -107,28 +97,27 @@ class Layout:
             growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
             std = float(np.sqrt(np.mean(np.square(tissue.std) + growth**2)))
             self.attitude_std[name] = std or RIGID_ATTITUDE_STD
-        kinds = {kind: [c for c in self.paths if c.kind == kind] for kind in ("fixed_point", "plane", "recorded")}
-        shapes = {
-            "length": (len(self.lengths),),
-            "heading": (len(self.sensors),),
-            "tilt": (len(self.sensors), 2),
-            "drift": (len(self.sensors),),
-            "hinge": (len(self.hinges), 2),
-            "foam": (len(self.soft), 9),
-            "twist": (len(self.twists),),
-            "girdle": (len(self.girdles), len(PARAMETERS)),
-            "point": (len(kinds["fixed_point"]), 3),
-            "height": (len(kinds["plane"]),),
-        }
         self.size = 0  # m
-        for name, shape in shapes.items():
-            places = self.size + np.arange(np.prod(shape, dtype=int)).reshape(shape)
-            setattr(self, name, places)
-            self.size += places.size
-        # Closure → the places of its point or height.
-        self.unknown = dict(zip((*kinds["fixed_point"], *kinds["plane"]), (*self.point, *self.height), strict=True))
+
+        def place(*shape: int) -> np.ndarray:
+            """Return the places of the next unknowns."""
+            begin, self.size = self.size, self.size + math.prod(shape)
+            return np.arange(begin, self.size).reshape(shape)
+
+        self.length = place(len(self.lengths))  # [m]
+        self.heading = place(len(self.sensors))  # ψ [rad]
+        self.tilt = place(len(self.sensors), 2)  # ε about x and y of L [rad]
+        self.drift = place(len(self.sensors))  # d [rad/s]
+        self.hinge = place(len(self.hinges), 2)  # of its axis along `across` and `tilted`
+        self.foam = place(len(self.soft), 9)  # A [rad], column by column
+        self.twist = place(len(self.twists))  # g
+        self.girdle = place(len(self.girdles), len(PARAMETERS))  # `body.girdle.PARAMETERS`
+        # Closure → the places of its fixed point of W, or the place of its plane's height [m].
+        self.unknown = {closure: place(3) for closure in self.paths if closure.kind == "fixed_point"}
+        self.unknown |= {closure: place() for closure in self.paths if closure.kind == "plane"}
         # Of a sample's data: Q of each sensor xyzw, the recorded place (3,) [m] in W where there is one, and the time.
-        self.place = slice(4 * len(self.sensors), 4 * len(self.sensors) + (3 if kinds["recorded"] else 0))
+        recorded = 3 * any(closure.kind == "recorded" for closure in self.paths)
+        self.place = slice(4 * len(self.sensors), 4 * len(self.sensors) + recorded)
         self.residuals = GAP_ROWS + len(self.hinges)  # of a sample
 
     @cached_property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -66,6 +66,7 @@ class CalibrationProblem:
     measured: Mapping[str, tuple[float, float]]  # name of a length → value and standard deviation [m]
     # diagnostics of mounts that are not used, as gravity or the motion contradicts them
     unused_mounts: tuple[Diagnostic, ...] = ()
+    exchanged: Mapping[str, str] = field(default_factory=dict)  # segment → label of the sensor on it, where they differ
 
     @property
     def protocol(self) -> Protocol:
@@ -160,15 +161,16 @@ class CalibrationProblem:
         problem = self.remove_mounts([each.place for each in unused])
         return replace(problem, unused_mounts=(*self.unused_mounts, *unused))
 
-    def relabel(self, moved: Mapping[str, str]) -> CalibrationProblem:
+    def relabel(self, exchanged: Mapping[str, str]) -> CalibrationProblem:
         """Return the same problem with exchanged sensors, segment → label; a stated mount goes with its sensor."""
 
         def exchange(values: Mapping[str, Any]) -> dict[str, Any]:
-            return {segment: values[moved.get(segment, segment)] for segment in values}
+            return {segment: values[exchanged.get(segment, segment)] for segment in values}
 
         recording = replace(self.recording, sensors=exchange(self.recording.sensors))
         R_VS, R_VS_start = exchange(self.filtered.R_VS), exchange(self.filtered.R_VS_start)
-        return replace(self, recording=recording, filtered=self.filtered._replace(R_VS=R_VS, R_VS_start=R_VS_start))
+        filtered = self.filtered._replace(R_VS=R_VS, R_VS_start=R_VS_start)
+        return replace(self, recording=recording, filtered=filtered, exchanged=exchanged)
 
     def orient_segments(self, mounts: Mapping[str, np.ndarray], samples: np.ndarray) -> dict[str, np.ndarray]:
         """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""

@@ -18,8 +18,9 @@ is zero. It is linear and homogeneous in the lengths ℓ, unless a length of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
@@ -59,6 +60,8 @@ WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degr
 MOST_LAG_STD = 0.15  # [rad/rad] from which on the motion does not show how far a sensor lags behind a twist
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
 BETTER = 0.6  # times the doubt of the stated labels, below which another labelling is the true one
+
+Alternative = Callable[[CalibrationProblem], CalibrationProblem]  # with other labels, or without some mounts
 
 
 def calibrate(
@@ -185,50 +188,55 @@ def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, me
 
 
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
-    """Return the solution without the mounts that gravity or the motion contradicts, its labels checked."""
+    """Return the solution without the mounts that gravity or the motion contradicts, its labels checked.
+
+    Alternatives are tried quickly. One takes the place of the problem where the limbs move as a person's with it.
+    """
     problem = problem.leave_out_mounts()
     problem.observe()  # raises where a phase is too short
-    quick = exchange_labels(leave_out_mounts(solve_problem(problem, quick=True)))
+    best = stated = solve_problem(problem, quick=True)
+    for list_alternatives, better in ((list_mount_alternatives, np.inf), (list_label_alternatives, BETTER)):
+        stated = best
+        limit = min(1.0, better * measure_doubt(stated)[0])
+        tried = [solve_problem(change(stated.problem), quick=True) for change in list_alternatives(stated)]
+        doubts = [measure_doubt(each)[0] for each in tried]
+        if min(doubts, default=np.inf) < limit:
+            best = tried[int(np.argmin(doubts))]
+    if best.problem.exchanged:
+        subject = replace(stated.subject, note="sensors sit elsewhere than labelled")
+        return replace(stated, subject=subject, remarks=(), exchanged=best.problem.exchanged)
     try:
-        return quick if quick.exchanged else solve_problem(quick.problem)
+        return solve_problem(best.problem)
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error
 
 
-def leave_out_mounts(stated: Calibration) -> Calibration:
-    """Return the quick solution without the mounts that the motion contradicts."""
-    problem = stated.problem
-    contradicted = problem.leave_out_mounts(stated.subject.mounts).unused_mounts != problem.unused_mounts
-    if measure_doubt(stated)[0] <= 1.0 and not contradicted:
-        return stated
-    free = solve_problem(problem.remove_mounts(problem.filtered.R_VS), quick=True)
-    without = problem.leave_out_mounts(free.subject.mounts)
-    if without.unused_mounts == problem.unused_mounts or measure_doubt(free)[0] >= 1.0:
-        return stated
-    return solve_problem(without, quick=True)
+def list_mount_alternatives(stated: Calibration) -> list[Alternative]:
+    """Return the problem without mounts that the motion contradicts, where the quick solution gives a reason."""
+
+    def leave_out_contradicted(problem: CalibrationProblem) -> CalibrationProblem:
+        free = solve_problem(problem.remove_mounts(problem.filtered.R_VS), quick=True)
+        return problem.leave_out_mounts(free.subject.mounts)
+
+    contradicted = stated.problem.leave_out_mounts(stated.subject.mounts).unused_mounts != stated.problem.unused_mounts
+    return [leave_out_contradicted] if contradicted or measure_doubt(stated)[0] > 1.0 else []
 
 
-def exchange_labels(stated: Calibration) -> Calibration:
-    """Return the quick solution with two sensors, or both sides, exchanged if the limbs move as a person's then.
+def list_label_alternatives(stated: Calibration) -> list[Alternative]:
+    """Return the problem with two sensors, or both sides, exchanged, where the limbs do not move as a person's.
 
     Joined hands close the chain for some exchanged sensors as well: left for right, or upper arm for forearm of a side,
     give the same gap. The solution's elbows then bend backward, or sideways, as a person's cannot. Any other exchange
     opens the chain.
     """
-    problem, (doubt, _), table = stated.problem, measure_doubt(stated), stated.problem.model.table
-    rotations = [*measure_rotations(stated).values()]
-    if doubt <= 1.0 or table.is_mechanism or not rotations or np.median(rotations) < LEAST_ROTATION:
-        return stated
-    places = [name for name in problem.layout.sensors if name in table.needed]
-    sides = [(a, b) for a, b in table.pairs.items() if {a, b} <= set(places)]
+    rotations, table = [*measure_rotations(stated).values()], stated.problem.model.table
+    if measure_doubt(stated)[0] <= 1.0 or table.is_mechanism or not rotations or np.median(rotations) < LEAST_ROTATION:
+        return []
+    places = [name for name in stated.problem.layout.sensors if name in table.needed]
     exchanges = [dict((pair, pair[::-1])) for pair in combinations(places, 2)]
+    sides = [pair for pair in table.pairs.items() if set(pair) <= set(places)]
     exchanges.append({a: b for pair in sides for a, b in (pair, pair[::-1])})
-    doubts = [measure_doubt(solve_problem(problem.relabel(labels), quick=True))[0] for labels in exchanges]
-    least = min(doubts)
-    if least >= min(1.0, BETTER * doubt):
-        return stated
-    subject = replace(stated.subject, note="sensors sit elsewhere than labelled")
-    return replace(stated, subject=subject, remarks=(), exchanged=exchanges[doubts.index(least)])
+    return [partial(CalibrationProblem.relabel, exchanged=exchange) for exchange in exchanges]
 
 
 # Solution -------------------------------------------------------------------------------------------------------------

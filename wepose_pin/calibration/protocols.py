@@ -17,7 +17,7 @@ The residual of a pose does not show how exactly it was taken, so its weight is 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -120,8 +120,8 @@ class Protocol:
     name: str  # of the protocol, and of its file
     title: str  # in a few words, for the subject's note
     needs: tuple[str, ...]  # segments that must carry a sensor
-    steps: tuple[Step, ...]  # for the person
-    conditions: tuple[Condition, ...]  # for the solver
+    steps: Annotated[tuple[Step, ...], None]  # for the person
+    conditions: Annotated[tuple[Condition, ...], None]  # for the solver
     measured_example: str = ""  # the length that fixes the scale best, as ``name=metres``; empty: any
 
     @property
@@ -210,7 +210,8 @@ def load_protocol(name: str | Path) -> Protocol:
 
 def _read_protocol(path: Path) -> Protocol:
     top = TomlTable(read_toml(path, "a protocol", BadOption), str(path), error=BadOption)
-    top.allow("name", "title", "needs", "measured_example", "step", "closure", "pose", "axis", "motion")
+    lists = ("step", "closure", "pose", "axis", "motion")
+    protocol = read_record(Protocol, top, base=Protocol(path.stem, "", (), (), ()), others=lists)
     conditions: list[Condition] = [_read_closure(entry) for entry in top.entries("closure")]
     for entry in top.entries("pose"):
         pose, directions = read_record(Direction, entry, others=("directions",)), entry.table("directions")
@@ -225,15 +226,8 @@ def _read_protocol(path: Path) -> Protocol:
     conditions += [read_record(FreeMotion, entry, base=FreeMotion("")) for entry in top.entries("motion")]
     if not conditions:
         raise BadOption(f"{path}: no [[closure]], [[pose]], [[axis]] or [[motion]]; a protocol needs one at least")
-    name = top.text("name", path.stem) or ""
-    return Protocol(
-        name,
-        top.text("title", name) or "",
-        top.texts("needs"),
-        tuple(read_record(Step, entry) for entry in top.entries("step")),
-        tuple(conditions),
-        top.text("measured_example", None) or "",
-    )
+    steps = tuple(read_record(Step, entry) for entry in top.entries("step"))
+    return replace(protocol, title=protocol.title or protocol.name, steps=steps, conditions=tuple(conditions))
 
 
 def _read_closure(entry: TomlTable) -> Closure:
