@@ -146,7 +146,7 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
         ),
         ("needs =", "measured_example = 'foo=1'\nneeds =", "measured_example: 'foo' is no length"),
         ("needs =", "needs ==", r"not valid TOML"),
-        ("needs =", "needs = 3 #", r"needs = 3; a text, or a list of texts is needed"),
+        ("needs =", "needs = 3 #", r"needs = 3; a list of texts is needed"),
         ("needs =", "needs = [3] #", r"needs\[0\] = 3; a text is needed"),
         ("points =", "points = 'left_palm' #", r"closure 1.points = \['left_palm'\]; kind 'coincide' takes 2"),
         ("points =", "points = [['left_palm'], 'right_palm'] #", r"points\[0\] = \['left_palm'\]; a text is needed"),
