@@ -1,4 +1,4 @@
-"""`wepose angles`: low-pass, stated uncertainty of ranges, comparison, tables, figures, page."""
+"""`wepose angles`: low-pass, stated uncertainty of ranges, tables, figures, page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 from commands import run
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
-from scipy.stats import ttest_ind
 from test_export import write_folder
 
 from wepose_pin import Pose, joint_angles
@@ -110,7 +109,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert re.search(r"before .* right elbow flexion rising +7 .* 1\.00", printed)
     assert "low-passed at 6 Hz" in printed
     tables = read_tables(out)
-    assert set(tables) == {*("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison")}
+    assert set(tables) == {*("angles", "sessions", "repetitions", "phases", "summary", "curves")}
     assert tables["sessions"].select("session", "n", "low_pass_hz").rows() == [("before", 7, 6.0), ("after", 7, 6.0)]
     elbow = (pl.col("joint") == "right_elbow") & (pl.col("angle") == "flexion")
     repetitions = tables["repetitions"].filter(elbow & (pl.col("session") == "before"))
@@ -121,16 +120,6 @@ def test_two_sessions_become_tables_figures_and_a_page(
     summary = tables["summary"].filter(elbow)
     assert summary["range_mean_deg"][0] == pytest.approx(repetitions["range_deg"].mean(), abs=1e-3)
     assert summary["range_sd_deg"][0] == pytest.approx(repetitions["range_deg"].std(), abs=1e-3)
-    compared = tables["comparison"].filter(elbow & (pl.col("measure") == "range")).row(0, named=True)
-    assert compared["difference"] == pytest.approx(
-        summary["range_mean_deg"][1] - summary["range_mean_deg"][0], abs=1e-3
-    )
-    before, after = (
-        tables["repetitions"].filter(elbow & (pl.col("session") == name))["range_deg"] for name in ("before", "after")
-    )
-    welch = ttest_ind(after, before, equal_var=False).confidence_interval(0.95)
-    assert (compared["ci95_low"], compared["ci95_high"]) == pytest.approx(tuple(welch), abs=1e-2)
-    assert compared["difference"] < 0.0
     curve = tables["curves"].filter(elbow & (pl.col("session") == "after"))
     assert curve["percent"].to_list() == list(range(101))
     assert curve["mean_deg"].max() == pytest.approx(70.0, abs=4.0)
@@ -144,7 +133,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     for picture in ("repetitions", "curves-elbow", "curves-shoulder", "curves-thorax", "angles-1", "angles-2"):
         ET.fromstring((out / f"{picture}.svg").read_text(encoding="utf-8"))
     page = (out / "angles.html").read_text(encoding="utf-8")
-    for words in ("half the amplitude there", "Z-X-Y", "after less before"):
+    for words in ("half the amplitude there", "Z-X-Y", "<td>after</td>"):
         assert words in page
     assert re.search(r"the range of [\w ]+, [\w ]+ \((before|after)\) varies most", page)
     cells = [page.index(f"<td>{angle}</td>") for angle in ("thorax, extension", "right elbow, flexion")]
@@ -159,7 +148,6 @@ def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Pat
     table = pl.read_csv(tmp_path / "a" / "repetitions.csv").unique("repetition", maintain_order=True)
     assert table.select("from_s", "to_s").rows() == [(4.0, 6.0), (6.0, 8.0)]
     assert not (tmp_path / "a" / "repetitions.svg").exists()
-    assert not (tmp_path / "a" / "comparison.csv").exists()
 
 
 def test_where_nothing_repeats_there_are_phases_all_the_same(

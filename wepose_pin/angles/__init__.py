@@ -20,6 +20,6 @@ from .joints import JointAngles as JointAngles
 from .joints import diagnose_lock as diagnose_lock
 from .joints import group_sides as group_sides
 from .joints import joint_angles as joint_angles
-from .tables import angle_table as angle_table
-from .tables import summary as summary
-from .tables import summary_table as summary_table
+from .movement import angle_table as angle_table
+from .movement import summary as summary
+from .movement import summary_table as summary_table

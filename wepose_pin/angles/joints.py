@@ -13,7 +13,7 @@ from .. import rotations
 from ..arguments import check_arguments
 from ..body.kinematics import Pose
 from ..diagnostics import INFO, Diagnostic
-from ..errors import BadData, BadOption, UnknownKey, one_of
+from ..errors import BadData, BadOption, Named, one_of
 from ..recording import AXES
 from ..rotations import conjugate, multiply
 from ..tracking import TrackResult
@@ -64,8 +64,9 @@ _HIP = ("flexion", "adduction", "internal_rotation")  # Wu 2002
 _KNEE = ("flexion", "adduction", "external_rotation")  # Grood and Suntay 1983
 _ANKLE = ("dorsiflexion", "inversion", "internal_rotation")  # Wu 2002
 
+SIDES = ("left", "right")
 JOINTS = {"thorax": Joint("world", "torso", _THORAX)}
-for _side in ("left", "right"):
+for _side in SIDES:
     JOINTS |= {
         f"{_side}_shoulder": Joint("torso", f"{_side}_upper_arm", (), ""),
         f"{_side}_elbow": Joint(f"{_side}_upper_arm", f"{_side}_forearm", _ELBOW),
@@ -73,7 +74,7 @@ for _side in ("left", "right"):
     }
 # In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
 JOINTS["pelvis_in_world"] = Joint("world", "pelvis", _PELVIS)
-for _side in ("left", "right"):
+for _side in SIDES:
     JOINTS |= {
         f"{_side}_hip": Joint("pelvis", f"{_side}_thigh", _HIP),
         f"{_side}_knee": Joint(f"{_side}_thigh", f"{_side}_shank", _KNEE, axes=KNEE_AXES),
@@ -101,9 +102,7 @@ class JointAngles:
 
     def __getitem__(self, angle: str) -> np.ndarray:
         """(n,) [rad], the values of the angle of this name."""
-        if angle not in self.names:
-            raise UnknownKey(f"no angle '{angle}'; {one_of(self.names, angle)}")
-        return self.values[:, self.names.index(angle)]
+        return Named("angle", dict(zip(self.names, self.values.T, strict=True)))[angle]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
@@ -125,9 +124,7 @@ class Angles:
 
     def __getitem__(self, joint: str) -> JointAngles:
         """The angles of the joint of this name."""
-        if joint not in self.joints:
-            raise UnknownKey(f"no joint '{joint}'; {one_of(self.joints, joint)}")
-        return self.joints[joint]
+        return Named("joint", self.joints)[joint]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.joints)
@@ -206,7 +203,7 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY") -> Angles:
         raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of((*SHOULDER_SEQUENCES, AUTO), sequence)}")
     joints = {}
     for name, joint in JOINTS.items():
-        if joint.distal in pose.quat_WL and (joint.proximal == "world" or joint.proximal in pose.quat_WL):
+        if _is_known(pose, joint):
             if not joint.sequence:
                 joint = joint._replace(sequence=sequence, names=SHOULDER_SEQUENCES[sequence])
             joints[name] = _angles(pose, joint, name.startswith("left_"))
@@ -226,14 +223,16 @@ def choose_shoulder_sequence(pose: Pose) -> str:
     It is YXY, which the ISB recommends, where that is near the lock for no more than `MAX_NEAR_LOCK` of the samples. An
     arm that hangs is in its lock.
     """
-    shares = dict.fromkeys(SHOULDER_SEQUENCES, 0.0)
+    shares = {}
     for sequence, names in SHOULDER_SEQUENCES.items():
-        for side in ("left", "right"):
-            joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names)
-            if {joint.proximal, joint.distal} <= set(pose.quat_WL):
-                near_lock = _angles(pose, joint, side == "left").near_lock
-                shares[sequence] = max(shares[sequence], float(np.mean(near_lock)))
-    return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=lambda sequence: shares[sequence])
+        shoulders = {side: JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names) for side in SIDES}
+        angles = [_angles(pose, joint, side == "left") for side, joint in shoulders.items() if _is_known(pose, joint)]
+        shares[sequence] = max((float(np.mean(each.near_lock)) for each in angles), default=0.0)
+    return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=shares.__getitem__)
+
+
+def _is_known(pose: Pose, joint: Joint) -> bool:
+    return {joint.proximal, joint.distal} <= {"world", *pose.quat_WL}
 
 
 def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:

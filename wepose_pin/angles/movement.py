@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-from scipy.special import stdtrit
+from scipy.spatial.transform import Rotation
 
 from ..body.kinematics import Pose, find_samples
 from ..errors import WrongOption, one_of
@@ -20,10 +20,12 @@ from ..recording import Intervals
 from ..recording.gaps import find_runs
 from ..rotations import unwrap_signs
 from .euler import count_turns
-from .joints import AUTO, JOINTS, Angles, joint_angles
+from .joints import AUTO, JOINTS, Angles, JointAngles, compute_gradients, joint_angles
 from .repetitions import PERCENT, MeanCurve, Repetitions, compute_mean_curves, find_repetitions
-from .tables import angle_table, compute_summary_std, summarize_joint
 
+# Rates are means over this time [s], to the nearest whole number of samples: noise of the orientation is divided by it,
+# and a sine of 2 Hz reads 1.6% low, one of 5 Hz 10%.
+RATE_WINDOW_S = 0.05
 MEASURES = {"lowest": "deg", "highest": "deg", "range": "deg", "peak_rate": "deg_s"}  # units in a file
 # A longer time step than this many usual ones ends a run: the samples on its two sides are filtered apart.
 _LONGEST_STEP = 1.5
@@ -108,23 +110,157 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
     return replace(pose, quat_WL=quat_WL, q=None)
 
 
-# Tables ------------------------------------------------------------------------------------------------------------
+# Range of motion and peak rates ---------------------------------------------------------------------------------------
+
+
+class JointSummary(NamedTuple):
+    """One joint over a recording; the three angles in the order of its `names`. NaN where no sample is left.
+
+    Gaps count nowhere; what is near the lock counts in the lowest and highest of the second angle.
+    """
+
+    lowest: np.ndarray  # (3,) [rad]
+    highest: np.ndarray  # (3,) [rad]
+    peak_rate: np.ndarray  # (3,) [rad/s], the greatest absolute rate of the angle over `RATE_WINDOW_S`
+    near_lock: float  # share of the samples
+    gap: float  # share of the samples
+    samples: np.ndarray  # (3, 4) int: of the lowest, the highest, begin and end of the fastest; −1 where there is none
+
+    @property
+    def range(self) -> np.ndarray:
+        """Range of motion (3,) [rad]; there is no more than a full turn of it."""
+        return np.minimum(self.highest - self.lowest, 2.0 * np.pi)
+
+
+def summary(angles: Angles) -> dict[str, JointSummary]:
+    """Range of motion and peak rates of every joint."""
+    return {name: summarize_joint(angles.time, joint) for name, joint in angles.joints.items()}
+
+
+def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(None)) -> JointSummary:
+    """Range of motion and peak rates of one joint in a part of the samples; `time` (n,) [s]."""
+    time, values, gap, near_lock = time[part], joint.values[part], joint.gap[part], joint.near_lock[part]
+    start = part.start or 0
+    m = max(1, round(RATE_WINDOW_S / float(np.median(np.diff(time))))) if len(time) > 1 else 1
+    span = time[m:] - time[:-m]
+    lowest, highest, peak_rate = np.full((3, 3), np.nan)
+    samples = np.full((3, 4), -1)
+    bad = np.concatenate([[0], np.cumsum(gap | near_lock)])
+    sound = np.flatnonzero(bad[m + 1 :] == bad[: -m - 1])  # none of the samples k … k + m is bad
+    for k in range(3):
+        usable = np.flatnonzero(~joint.hidden(k)[part])
+        if len(usable):
+            ends = usable[[values[usable, k].argmin(), values[usable, k].argmax()]]
+            lowest[k], highest[k] = values[ends, k]
+            samples[k, :2] = start + ends
+        if len(sound):
+            rates = np.abs(values[m:, k] - values[:-m, k])[sound] / span[sound]
+            first = start + sound[rates.argmax()]
+            samples[k, 2:] = first, first + m
+            peak_rate[k] = rates.max()
+    return JointSummary(lowest, highest, peak_rate, float(np.mean(near_lock)), float(np.mean(gap)), samples)
+
+
+def compute_summary_std(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:
+    """Compute the standard deviations of a joint's summaries, to first order; NaN where nothing is stated.
+
+    A range and a rate are of two samples. Their error is taken once as constant in W, as that of a heading, and once as
+    constant in each segment, as that of a mount; the larger standard deviation of the two counts. `samples` (s, 3, 4)
+    are those of `JointSummary` for each of s spans; of the same shape are the results: of the lowest, the highest and
+    the range [rad], and of the peak rate [rad/s].
+    """
+    stds = np.full(samples.shape, np.nan)
+    if joint.std is None:
+        return stds
+    for k in range(3):
+        for column, ends in ((2, slice(0, 2)), (3, slice(2, 4))):
+            known = np.flatnonzero(samples[:, k, ends.start] >= 0)
+            pairs = samples[known, k, ends]
+            stds[known, k, column] = _difference_std(pose, name, joint, k, pairs)
+            if column == 2:
+                stds[known, k, :2] = joint.std[pairs, k]
+            else:
+                stds[known, k, 3] /= pose.time[pairs[:, 1]] - pose.time[pairs[:, 0]]
+    return stds
+
+
+def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np.ndarray) -> np.ndarray:
+    """Standard deviations (m,) [rad] of the k-th angle at the second sample of each pair (m, 2) less the first."""
+    rows = compute_gradients(pose, name, joint, pairs.ravel())[:, k].reshape(-1, 2, 1, 3)
+    variances = np.zeros((2, len(pairs)))  # constant in W, in L
+    for segment in (JOINTS[name].proximal, JOINTS[name].distal):
+        if segment == "world" or not len(pairs):
+            continue
+        cov_W = pose.segment_cov[segment][pairs]
+        R_WL = Rotation.from_quat(pose.quat_WL[segment][pairs.ravel()]).as_matrix().reshape(-1, 2, 3, 3)
+        frames = (rows, cov_W), (rows @ R_WL, np.swapaxes(R_WL, 2, 3) @ cov_W @ R_WL)
+        for variance, (gradient, cov) in zip(variances, frames, strict=True):
+            difference = gradient[:, 1] - gradient[:, 0]
+            variance += (difference @ cov.mean(axis=1) @ np.swapaxes(difference, 1, 2))[:, 0, 0]
+    return np.asarray(np.sqrt(np.maximum(variances.max(axis=0), 0.0)))
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+
+def angle_table(angles: Angles) -> pl.DataFrame:
+    """The columns of a file.
+
+    ``time`` [s]; for each joint ``<joint>_<angle>_deg`` of its three angles, such as ``right_elbow_flexion_deg``, and
+    ``<joint>_<angle>_std_deg`` where known; ``<joint>_gimbal_deg``, ``<joint>_near_lock``, ``<joint>_gap``; and the
+    rotation itself, ``<joint>_qx,_qy,_qz,_qw``.
+    """
+    table = {"time": angles.time}
+    for name, joint in angles.joints.items():
+        for k, angle in enumerate(joint.names):
+            table[f"{name}_{angle}_deg"] = np.degrees(joint.values[:, k])
+            if joint.std is not None:
+                table[f"{name}_{angle}_std_deg"] = np.degrees(joint.std[:, k])
+        table[f"{name}_gimbal_deg"] = np.degrees(joint.gimbal)
+        table[f"{name}_near_lock"] = joint.near_lock
+        table[f"{name}_gap"] = joint.gap
+        table |= {f"{name}_{c}": joint.quat[:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
+    return pl.DataFrame(table)
+
+
+def summary_table(angles: Angles) -> pl.DataFrame:
+    """`summary` in degrees, a row an angle; values of the joint are in each of its three rows."""
+    return pl.DataFrame(
+        {
+            "joint": name,
+            "angle": angle,
+            "lowest_deg": np.degrees(ranges.lowest[k]),
+            "highest_deg": np.degrees(ranges.highest[k]),
+            "range_deg": np.degrees(ranges.range[k]),
+            "peak_rate_deg_s": np.degrees(ranges.peak_rate[k]),
+            "joint_near_lock": ranges.near_lock,
+            "joint_gap": ranges.gap,
+        }
+        for name, ranges in summary(angles).items()
+        for k, angle in enumerate(angles[name].names)
+    )
 
 
 def build_tables(movements: Sequence[Movement]) -> dict[str, pl.DataFrame]:
     """Build all tables, by the names of their files; one without rows is empty."""
     angles = [angle_table(each.angles).select(pl.lit(each.name).alias("session"), pl.all()) for each in movements]
-    repeating = [each for each in movements if len(each.repetitions.spans)]
-    repetitions = _concat([_tabulate_spans(each, _list_repetitions(each)) for each in repeating])
-    summary = build_summary_table(movements, repetitions)
+    repetitions, phases = [], []
+    for movement in movements:
+        spans = enumerate(movement.repetitions.spans.tolist(), 1)
+        about = [{"repetition": k, "from_s": a, "to_s": b, "duration_s": b - a} for k, (a, b) in spans]
+        repetitions += [_tabulate_spans(movement, about)] if about else []
+        selected = movement.angles.time[[0, -1]].tolist()
+        named = [(name, *each) for name, spans in movement.phases.items() for each in enumerate(spans, 1)]
+        keys = ("phase", "number", "from_s", "to_s")
+        about = [dict(zip(keys, (name, k, *span), strict=True)) for name, k, span in [("all", 1, selected), *named]]
+        phases.append(_tabulate_spans(movement, about))
     return {
         "angles": pl.concat(angles, how="diagonal"),
-        "sessions": build_session_table(movements),
-        "repetitions": repetitions,
-        "phases": _concat([_tabulate_spans(each, _list_phases(each)) for each in movements]),
-        "summary": summary,
-        "curves": build_curve_table(movements),
-        "comparison": build_comparison_table(summary),
+        "sessions": _tabulate_sessions(movements),
+        "repetitions": _concat(repetitions),
+        "phases": _concat(phases),
+        "summary": _summarize_repetitions(movements, _concat(repetitions)),
+        "curves": _tabulate_curves(movements),
     }
 
 
@@ -132,7 +268,7 @@ def _concat(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
     return pl.concat(tables) if tables else pl.DataFrame()
 
 
-def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
+def _tabulate_sessions(movements: Sequence[Movement]) -> pl.DataFrame:
     """Build a row a session: its time, how repetitions were found, their number and duration."""
     rows = []
     for movement in movements:
@@ -157,22 +293,6 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
     return pl.DataFrame(rows, schema_overrides={"low_pass_hz": pl.Float64})
 
 
-def _list_phases(movement: Movement) -> list[dict[str, Any]]:
-    """List all of the selected time, and each interval of a phase that lies in it."""
-    time = movement.angles.time
-    about = [{"phase": "all", "number": 1, "from_s": float(time[0]), "to_s": float(time[-1])}]
-    for name, spans in movement.phases.items():
-        about += [{"phase": name, "number": k, "from_s": a, "to_s": b} for k, (a, b) in enumerate(spans, 1)]
-    return about
-
-
-def _list_repetitions(movement: Movement) -> list[dict[str, Any]]:
-    return [
-        {"repetition": k, "from_s": begin, "to_s": end, "duration_s": end - begin}
-        for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
-    ]
-
-
 def _tabulate_spans(movement: Movement, about: Sequence[Mapping[str, Any]]) -> pl.DataFrame:
     """Build a row an angle in each span, both ends included: what is known of it, `MEASURES`, each with its ±."""
     pose, rows = movement.pose, [list[dict[str, Any]]() for _ in about]
@@ -192,7 +312,7 @@ def _tabulate_spans(movement: Movement, about: Sequence[Mapping[str, Any]]) -> p
     return pl.DataFrame([row for own in rows for row in own])
 
 
-def build_summary_table(movements: Sequence[Movement], repetitions: pl.DataFrame) -> pl.DataFrame:
+def _summarize_repetitions(movements: Sequence[Movement], repetitions: pl.DataFrame) -> pl.DataFrame:
     """Build a row an angle of each session: mean and deviation over repetitions, what is stated, and the CMC."""
     if not len(repetitions):
         return pl.DataFrame()
@@ -214,7 +334,7 @@ def build_summary_table(movements: Sequence[Movement], repetitions: pl.DataFrame
     return table.join(pl.DataFrame(cmc), on=names[:3], maintain_order="left")
 
 
-def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
+def _tabulate_curves(movements: Sequence[Movement]) -> pl.DataFrame:
     """Build a row a percent of the repetition of each angle and session."""
     tables = []
     for movement in movements:
@@ -225,38 +345,3 @@ def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 table = pl.DataFrame({"percent": PERCENT, "n": curve.n} | degrees)
                 tables.append(table.select(*(pl.lit(text).alias(key) for key, text in about.items()), pl.all()))
     return _concat(tables)
-
-
-def build_comparison_table(summary: pl.DataFrame) -> pl.DataFrame:
-    """Compare each further session with the first, a row a measure of each angle that both have."""
-    sessions = summary["session"].unique(maintain_order=True).to_list() if len(summary) else []
-    rows: list[dict[str, Any]] = []
-    for session in sessions[1:]:
-        against, further = (summary.filter(pl.col("session") == each) for each in (sessions[0], session))
-        for row in against.join(further, on=("joint", "angle"), maintain_order="left").iter_rows(named=True):
-            about = {"session": session, "against": sessions[0], "joint": row["joint"], "angle": row["angle"]}
-            for measure, unit in MEASURES.items():
-                parts = ("n", f"mean_{unit}", f"sd_{unit}", f"std_{unit}")
-                n, mean, sd, std = ([row[f"{measure}_{part}{end}"] for end in ("", "_right")] for part in parts)
-                low, high = compute_interval((n[0], mean[0], sd[0]), (n[1], mean[1], sd[1]))
-                values = {"first_n": n[0], "n": n[1], "first_mean": mean[0], "first_sd": sd[0], "mean": mean[1]}
-                values |= {"sd": sd[1], "difference": mean[1] - mean[0], "ci95_low": low, "ci95_high": high}
-                values["difference_std"] = float(np.hypot(*std))
-                rows.append({**about, "measure": measure, "unit": unit.replace("_", "/"), **values})
-    return pl.DataFrame(rows)
-
-
-def compute_interval(first: tuple[int, float, float], second: tuple[int, float, float]) -> tuple[float, float]:
-    """Compute the 95 % interval (Welch 1947) of a difference of means, by n, mean and standard deviation of each.
-
-    It is from the spread of the values alone; NaN where there are fewer than two of either.
-    """
-    value = second[1] - first[1]
-    if min(first[0], second[0]) < 2:
-        return float("nan"), float("nan")
-    a, b = first[2] ** 2 / first[0], second[2] ** 2 / second[0]
-    half = 0.0
-    if a + b > 0.0:
-        freedom = (a + b) ** 2 / (a**2 / (first[0] - 1) + b**2 / (second[0] - 1))
-        half = float(stdtrit(freedom, 0.975) * np.sqrt(a + b))
-    return value - half, value + half

@@ -62,10 +62,8 @@ def find_main_angle(angles: Angles) -> str | None:
     """
     ranges: dict[str, tuple[bool, float]] = {}
     for angle, (joint, k) in list_angles(angles).items():
-        each = angles[joint]
-        hidden = each.hidden(k)
-        near_lock = each.near_lock & ~each.gap if k != 1 else np.zeros(len(hidden))
-        if np.mean(near_lock) <= MAX_NEAR_LOCK and np.mean(each.gap) <= MAX_GAP:
+        each, hidden = angles[joint], angles[joint].hidden(k)
+        if np.mean(hidden & ~each.gap) <= MAX_NEAR_LOCK and np.mean(each.gap) <= MAX_GAP:
             low, high = np.percentile(each.values[~hidden, k], [2.0, 98.0])
             ranges[angle] = (JOINTS[joint].proximal != "world", float(high - low))
     return max(ranges, key=lambda angle: ranges[angle], default=None)
@@ -127,8 +125,7 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
 def _are_alike(curves: np.ndarray) -> np.ndarray:
     """(r,) bool, which of the curves (r, p) correlate with the median curve."""
     centred = curves - curves.mean(axis=1, keepdims=True)
-    usual = np.median(centred, axis=0)
-    usual -= usual.mean()
+    usual = np.median(centred, axis=0) - np.median(centred, axis=0).mean()
     size = np.linalg.norm(centred, axis=1) * np.linalg.norm(usual)
     return np.asarray(centred @ usual >= MIN_CORRELATION * np.maximum(size, 1e-12))
 
@@ -204,12 +201,8 @@ class MeanCurve(NamedTuple):
 
 def normalize_time(time: np.ndarray, values: np.ndarray, spans: np.ndarray) -> np.ndarray:
     """Return values (n, k) at `POINTS` even times of each span (r, 2) [s], linear between samples: (r, POINTS, k)."""
-    curves = np.empty((len(spans), POINTS, values.shape[1]))
-    for row, (begin, end) in zip(curves, spans, strict=True):
-        at = begin + (end - begin) * PERCENT / 100.0
-        for k in range(values.shape[1]):
-            row[:, k] = np.interp(at, time, values[:, k])
-    return curves
+    at = spans[:, :1] + np.diff(spans, axis=1) * PERCENT / 100.0
+    return np.stack([np.interp(at, time, column) for column in values.T], axis=2)
 
 
 def compute_cmc(curves: np.ndarray) -> float:

@@ -59,17 +59,9 @@ def joint_torques(
 ) -> Torques:
     """Compute the torques of the joints that bear a mass, by `pin.rnea`.
 
-    Parameters
-    ----------
-    model : with inertias in [kg], [kg m²], z up; a `BodyModel` has one in `pin`
-    time, q : (n,) [s], uniform; (n, nq)
-    cutoff_hz : of the smoothing; below half of the sampling rate
-    joints : those that are asked for, by Pinocchio's number; None: all that bear a mass
-
-    Raises
-    ------
-    BadModel, BadOption, BadData
-        The model has no masses; a cut-off that is not possible; too few samples to smooth.
+    `model` has inertias in [kg], [kg m²], z up, as the `pin` of a `BodyModel`; `time` (n,) [s] is uniform, `q`
+    (n, nq). `joints` are those that are asked for, by Pinocchio's number; None: all. `BadModel`: the model has no
+    masses; `BadOption`: a cut-off that is not possible; `BadData`: too few samples to smooth.
     """
     mass = sum(inertia.mass for inertia in model.inertias[1:])
     if mass < _LEAST_MASS:
@@ -88,8 +80,7 @@ def joint_torques(
             q[:, first] = np.unwrap(q[:, first])
     # The motion is mirrored for a second beyond each end, where the filter's transient decays.
     pad = min(len(time) - 1, max(_LEAST_SAMPLES - 1, round(rate_hz)))
-    smooth = low_pass(q, cutoff_hz, rate_hz, pad)
-    q = np.array([pin.normalize(model, row) for row in smooth])
+    q = np.array([pin.normalize(model, row) for row in low_pass(q, cutoff_hz, rate_hz, pad)])
     # Central differences; the ends repeat.
     half = np.array([pin.difference(model, a, b) for a, b in pairwise(q)]) * rate_hz
     v = np.concatenate((half[:1], 0.5 * (half[1:] + half[:-1]), half[-1:]))

@@ -34,7 +34,7 @@ def angles(
 
     Angles are those of the International Society of Biomechanics (docs/angles.md). Repetitions of the movement are
     found by the angle of the largest range, or taken from a phase of the recording, and normalised in time, 0 to 100 %.
-    Several results are compared with the first one, for example of the same person before and after a treatment.
+    Several results are shown side by side, for example of the same person before and after a treatment.
 
     Example: wepose angles before after -o angles --low-pass-hz 6
 
@@ -43,7 +43,7 @@ def angles(
     result
         Folder that `wepose track` wrote.
     further
-        Further results, each compared with the first one.
+        Further results, shown beside the first one.
     out
         Write tables as .csv (all angles over time; lowest, highest, range and peak rate in each repetition and phase;
         means; curves), the figures as .svg, and angles.html, which shows all of it, to this folder.

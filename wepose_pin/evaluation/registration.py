@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -102,10 +103,9 @@ def _is_known(values: np.ndarray | None) -> bool:
 
 def _sample_both(pose: Pose, truth: Pose, segment: str, time: np.ndarray) -> tuple[Rotation, Rotation]:
     """Sample the orientations of a segment in both at those of the times (n,) [s] at which both are known."""
-    sampled = [sample(each.time, each.quat_WL[segment], time) for each in (pose, truth)]
-    known = np.isfinite(sampled).all(axis=(0, 2))
-    ours, theirs = (Rotation.from_quat(quat[known]) for quat in sampled)
-    return ours, theirs
+    ours, theirs = (sample(each.time, each.quat_WL[segment], time) for each in (pose, truth))
+    known = np.isfinite(ours + theirs).all(axis=1)
+    return Rotation.from_quat(ours[known]), Rotation.from_quat(theirs[known])
 
 
 def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[float, float]:
@@ -154,15 +154,12 @@ def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
 
 def _correlate(a: np.ndarray, b: np.ndarray, least: float) -> np.ndarray:
     """Correlate a (n,) with b (m,) at all lags (n + m − 1,), over what both know; NaN where that is too little."""
-    masks = [np.isfinite(x).astype(float) for x in (a, b)]
-    centred = [np.nan_to_num(x - np.sum(np.nan_to_num(x)) / max(np.isfinite(x).sum(), 1)) for x in (a, b)]
-
-    def at_lags(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.asarray(correlate(y, x, mode="full", method="fft"))
-
-    power = np.sqrt(np.maximum(at_lags(centred[0] ** 2, masks[1]) * at_lags(masks[0], centred[1] ** 2), 0.0))
-    known = (at_lags(*masks) >= least - 0.5) & (power > max(1e-9 * float(power.max()), 1e-6))
-    return np.where(known, at_lags(*centred) / np.where(known, power, 1.0), np.nan)
+    at_lags = partial(correlate, mode="full", method="fft")
+    known = [np.isfinite(x).astype(float) for x in (b, a)]
+    centred = [np.nan_to_num(x - np.sum(np.nan_to_num(x)) / max(np.isfinite(x).sum(), 1)) for x in (b, a)]
+    power = np.sqrt(np.maximum(at_lags(known[0], centred[1] ** 2) * at_lags(centred[0] ** 2, known[1]), 0.0))
+    enough = (at_lags(*known) >= least - 0.5) & (power > max(1e-9 * float(power.max()), 1e-6))
+    return np.where(enough, at_lags(*centred) / np.where(enough, power, 1.0), np.nan)
 
 
 # World -------------------------------------------------------------------------------------------------------------

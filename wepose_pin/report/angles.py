@@ -28,7 +28,6 @@ from .page import MOST_FIGURES, render_page
 from .words import Table, number, plain, plus_minus
 
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
-CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
 SESSIONS: list[dict[str, Any]] = [  # lines of the sessions, in turn
     {"color": colour, "linestyle": dashes}
@@ -41,11 +40,6 @@ ADVICE = (
 CURVES = (
     "Each repetition from 0 to 100 % of its own time. Where fewer than half of the repetitions are determined, as near "
     "gimbal lock, a line is broken."
-)
-COMPARISON = (
-    "Differences of means, with the 95 % interval from the spread between repetitions (Welch 1947). They are of one "
-    "person: the interval says nothing of groups, nor of errors that a session shares. Bold: it excludes zero, and the "
-    "difference is more than twice what the poses state (`difference_std` in comparison.csv)."
 )
 WHOLE_TIME = (
     "± is what the pose states. Samples in gaps count nowhere, those near gimbal lock only in the range of the second "
@@ -66,7 +60,6 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
     curves = [figure for name, figure in figures.items() if name.startswith("curves")]
     shown = curves[: MOST_FIGURES - 1 - len(repetitions)]
     missing = explain_missing(movements)
-    comparisons = tabulate_comparisons(tables["comparison"])
     return render_page(
         f"Joint angles of {' and '.join(movement.name for movement in movements)}",
         [_describe_reliance(tables["summary"]), tabulate_sessions(tables["sessions"]), _describe(movements)],
@@ -74,7 +67,6 @@ def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.Da
             "Repetitions": [*missing, *repetitions],
             "Mean curves": [CURVES, *shown] if shown else [],
             "Means over the repetitions": [tabulate_means(tables["summary"])] if len(tables["summary"]) else [],
-            "Sessions compared": [COMPARISON, *comparisons] if comparisons else [],
             "All of the time": [WHOLE_TIME, over_time, _tabulate_whole_time(tables["phases"])],
         },
     )
@@ -158,23 +150,6 @@ def tabulate_means(summary: pl.DataFrame) -> Table:
     title = "Mean ± standard deviation between the repetitions, in square brackets what the pose states for one"
     cells_by_angle = [[angle, *cells] for angle, sessions in rows.items() for cells in sessions]
     return Table(title, ["angle", "session", *HEADINGS, "CMC"], cells_by_angle)
-
-
-def tabulate_comparisons(comparison: pl.DataFrame) -> list[Table]:
-    """A table of each further session against the first."""
-    tables: dict[str, dict[str, list[str]]] = {}
-    for row in comparison.iter_rows(named=True):
-        value, low, high, std = (row[key] for key in ("difference", "ci95_low", "ci95_high", "difference_std"))
-        text = number(value, 1, sign="+", unknown="")
-        if np.isfinite(low):
-            text += f" ({number(low, 1, sign='+')} to {number(high, 1, sign='+')})"
-            if low * high > 0.0 and abs(value) > CLEAR * np.nan_to_num(std):
-                text = f"**{text}**"
-        tables.setdefault(f"{row['session']} less {row['against']}", {}).setdefault(_name(row), []).append(text)
-    return [
-        Table(title, ["angle", *HEADINGS], [[angle, *cells] for angle, cells in table.items()])
-        for title, table in tables.items()
-    ]
 
 
 def _tabulate_whole_time(phases: pl.DataFrame) -> Table:

@@ -13,7 +13,7 @@ import polars as pl
 
 from ..body import BodyModel
 from ..body.configuration import solve_configuration
-from ..body.kinematics import Pose, build_pose_table
+from ..body.kinematics import Pose, build_pose_table, find_usual_rate
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic, notebook_html
 from ..errors import BadData, Named, WeposeError, how_to_install
@@ -57,7 +57,7 @@ class TrackResult:
     @property
     def rate_hz(self) -> float:
         """One over the usual time step, to six digits; NaN of one sample."""
-        return float(f"{1.0 / np.median(np.diff(self.time)):.6g}") if len(self.time) > 1 else float("nan")
+        return find_usual_rate(self.time)
 
     @property
     def where(self) -> str:
