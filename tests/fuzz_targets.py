@@ -100,7 +100,7 @@ def live_log() -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream, use_chunking=False)
     header = {
-        **{"format": 3, "name": "live", "sensors": ["torso"], "mounts": {"torso": [0.0, 0.0, 0.0, 1.0]}, "phases": {}},
+        **{"format": 4, "name": "live", "sensors": ["torso"], "mounts": {"torso": [0.0, 0.0, 0.0, 1.0]}, "phases": {}},
         **{"start_pose": "n_pose", "remounted": False, "subject": None, "method": "amekf"},
     }
     writer.start("wepose-live", "seeds")

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import MILD_PRESET, Simulation, simulate, simulate_person
-from wepose_pin.live.sources.base import Source
+from wepose_pin.live.sources import Source
 from wepose_pin.recording.arrivals import Samples
 
 RATE_HZ = 100.0

@@ -10,8 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from wepose_pin.live.sources import open_source
-from wepose_pin.live.sources.base import Source
+from wepose_pin.live.sources import Source, open_source
 from wepose_pin.recording.arrivals import Samples
 
 S = TypeVar("S", bound=Source)

@@ -122,7 +122,7 @@ def test_a_live_recording_that_is_damaged(tmp_path: Path) -> None:
     for old, new, says in (
         (b'"rate_hz": 100.0', b'"rate_hz": 1e300', "ticks at 1e+300 Hz"),
         (b'"kind": "clock"', b'"kind": "clokc"', "broke off before the start pose"),
-        (b'"format": 3', b'"format": 4', "this version reads format 3"),
+        (b'"format": 4', b'"format": 3', "this version reads format 4"),
         (b'"gyro": [0.0, 0.0, 0.0]', b'"gyro": [0.0, 0.0, "0"]', "cannot be read as a recording of wepose live"),
         (b'"gyro": [0.0, 0.0, 0.0]', b'"gyro": [0.0, 0.0     ]', "cannot be read as a recording of wepose live"),
         (b'{"t": 0.5', b'["t", 0.5', "cannot be read as a recording of wepose live"),

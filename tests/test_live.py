@@ -20,7 +20,7 @@ import wepose_pin as wp
 from wepose_pin import OrientationSensor, Recording, Simulation, TrackResult, live, population_subject, track
 from wepose_pin.body.subject import mount_rows
 from wepose_pin.live import Output, Request
-from wepose_pin.live.sources.base import Source
+from wepose_pin.live.sources import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.readers.live_log import LiveRecording, read_live_log
 from wepose_pin.recording.arrivals import Samples

@@ -111,7 +111,6 @@ def test_wrong_options_are_one_line(session: Path, tmp_path: Path, capsys: pytes
     file.write_bytes(b"something")
     replay, unknown = f"replay:{session}", "mounted is not known: find it out with --guide"
     for arguments, message in (
-        (["--source", "mti:/dev/null=torso"], f"how the sensor of torso is {unknown}"),
         (["--source", "udp:9000"], f"how the sensors are {unknown}"),
         (["--source", "udp:9000", "--stature", "1.8"], "--stature: goes with --guide"),
         (["--source", "udp:9000", "--guide", "--protocol", "free", "-o", str(tmp_path)], "free: has no motion"),

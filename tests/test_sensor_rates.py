@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wepose_pin.live.sources.base import Source
+from wepose_pin.live.sources import Source
 from wepose_pin.live.ticks import SensorMonitor
 from wepose_pin.recording.arrivals import Samples
 

@@ -41,7 +41,7 @@ RUN = [
 # What is not run on these pages, and why.
 ELSEWHERE = {
     r"^(pip|make|cd|python3 -m venv) ": "sets up a machine: .ci/run does it",
-    r"--source (udp|mti|lsl)|--guide": "waits for sensors: tests/test_sources_*.py, test_guide.py",
+    r"--source (udp|lsl)|--guide": "waits for sensors: tests/test_sources_*.py, test_guide.py",
     r"humanSubject01|arm\.(toml|urdf)": "a file of the reader's: benchmarks/bodies.py",
     r"ours\.toml|session\.toml --method smekf": "a file of the reader's: tests/test_reference.py, test_chain.py",
     r"before after|session.toml --model whole_body": "two sessions, legs: tests/test_repetitions.py, test_legs.py",

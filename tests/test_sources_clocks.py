@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wepose_pin.live.sources.base import HostClock
+from wepose_pin.live.sources import HostClock
 
 
 def mapped(time: np.ndarray, arrival: np.ndarray) -> np.ndarray:

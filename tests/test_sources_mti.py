@@ -1,4 +1,4 @@
-"""MTi sensors on pseudo-terminals: read, lost and found again; frames as the protocol describes them."""
+"""The plug-in examples/mti on pseudo-terminals: read, lost and found again; frames as the protocol describes them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import pty
 import select
 import struct
+import sys
 import threading
 import time
 import tty
@@ -17,9 +18,13 @@ import numpy as np
 import pytest
 from sampling import collect, connected, wait_until
 
-from wepose_pin.live.sources import mti, open_source
+from wepose_pin.errors import BadOption
+from wepose_pin.live.sources import Source, SourceOptions
 
-serial = pytest.importorskip("serial")
+pytest.importorskip("serial")
+sys.path.append(str(Path(__file__).parents[1] / "examples" / "mti"))
+import wepose_mti as mti
+
 GYRO, ACCEL = [0.25, -1.5, 3.125], [-0.5, 9.8125, 0.0625]
 VECTORS = struct.pack("!fff", *GYRO), struct.pack("!fff", *ACCEL)
 
@@ -32,6 +37,10 @@ def whole(mid: int, data: bytes) -> bytes:
 
 def item(kind: int, data: bytes) -> bytes:
     return struct.pack("!HB", kind, len(data)) + data
+
+
+def mti_source(devices: str) -> Source:
+    return mti.SOURCE.open_spec(devices, SourceOptions(f"mti:{devices}", None, ("torso", "head")))
 
 
 class Device:
@@ -103,9 +112,8 @@ def plugged(tmp_path: Path) -> Iterator[Plug]:
 def test_two_sensors(plugged: Plug) -> None:
     one, two = plugged("one", 50), plugged("two", 50)
     begin = time.monotonic()
-    with connected(f"mti:{one.link}=torso,{two.link}=head") as source:
+    with connected(mti_source(f"{one.link}=torso,{two.link}=head")) as source:
         assert source.sensors == ("torso", "head")
-        assert source.describe_awaited() == f"MTi sensors: torso at {one.link}, head at {two.link}"
         samples = collect(source, 40, sensors=2)
     for name in ("torso", "head"):
         np.testing.assert_array_equal(samples[name].gyro_S, np.tile(GYRO, (len(samples[name].time), 1)))
@@ -119,7 +127,7 @@ def test_a_port_that_vanishes_is_taken_up_again(plugged: Plug) -> None:
     """The other sensor goes on; the clock of the one that comes back begins anew."""
     gone, stays = plugged("one"), plugged("two")
     begin = time.monotonic()
-    with connected(f"mti:{gone.link}=torso,{stays.link}=head") as source:
+    with connected(mti_source(f"{gone.link}=torso,{stays.link}=head")) as source:
         collect(source, 20, sensors=2)
         gone.pull()
         wait_until(lambda: source.read(0.1) and source.problems.get("connections lost to torso"))
@@ -134,7 +142,7 @@ def test_a_port_that_vanishes_is_taken_up_again(plugged: Plug) -> None:
 def test_a_device_that_falls_silent_is_woken(plugged: Plug, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mti, "SILENT_S", 0.2)
     device = plugged("one")
-    with connected(f"mti:{device.link}=torso") as source:
+    with connected(mti_source(f"{device.link}=torso")) as source:
         collect(source, 20)
         device.measuring = False  # its supply failed, it starts in config state, the port stays
         while source.read(0.1):
@@ -147,10 +155,10 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
 ) -> None:
     monkeypatch.setattr(mti, "SILENT_S", 0.2)
     before = set(threading.enumerate())
-    source = open_source(f"mti:{tmp_path / 'one'}=torso")
+    source = mti_source(f"{tmp_path / 'one'}=torso")
     place = f"the MTi of torso at {tmp_path / 'one'}: "
     source.open()
-    wait_until(lambda: source.describe_awaited() == f"{place}cannot open the port (No such file or directory)")
+    wait_until(lambda: "No such file or directory" in source.describe_awaited())
     assert not source.connect(0.1)
     device = plugged("one")
     device.deaf = True
@@ -165,6 +173,19 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
     assert len(set(threading.enumerate()) - before) == 1  # the device
 
 
+@pytest.mark.parametrize(
+    ("devices", "words"),
+    [
+        ("/dev/ttyUSB0", "'/dev/ttyUSB0': DEVICE=SEGMENT is needed"),
+        ("/dev/ttyUSB0=trso", "did you mean 'torso'"),
+        ("/dev/a=torso,/dev/a=head", "'/dev/a=head': DEVICE=SEGMENT is needed, each device"),
+    ],
+)
+def test_wrong_devices_are_one_line(devices: str, words: str) -> None:
+    with pytest.raises(BadOption, match=words):
+        mti_source(devices)
+
+
 # Frames and packets --------------------------------------------------------------------------------------------------
 
 
@@ -173,7 +194,7 @@ def test_frames_come_out_of_noise(plugged: Plug) -> None:
     rng, device = np.random.default_rng(3), plugged("one")
     bad = whole(0x36, bytes(20))
     device.noise = lambda: rng.bytes(9) + bad[:-1] + bytes([bad[-1] ^ 1]) + b"\xfa\xff\x36\x05"
-    with connected(f"mti:{device.link}=torso") as source:
+    with connected(mti_source(f"{device.link}=torso")) as source:
         torso = collect(source, 50)["torso"]
         assert len(torso.time) >= 50
         assert (torso.gyro_S == GYRO).all()
@@ -189,7 +210,7 @@ def test_a_packet_of_a_device(plugged: Plug) -> None:
         "8030103F80000037DF8801B6898000B608C000C0200CBEFBFBF23F33C485BFA0A2C108100442168000"
         "301004000186E1E0200400400003"
     )
-    with connected(f"mti:{device.link}=torso") as source:
+    with connected(mti_source(f"{device.link}=torso")) as source:
         torso = collect(source, 1)["torso"]
     np.testing.assert_allclose(torso.gyro_S[0], [0.02131760, -0.00327826, -0.00163019], atol=1e-8)
     np.testing.assert_allclose(torso.accel_S[0], [-0.05550629, 9.81465530, 0.21842313], atol=1e-8)
@@ -206,7 +227,7 @@ def test_a_packet_of_a_device(plugged: Plug) -> None:
 )
 def test_a_packet_without_a_sample_is_counted(packet: bytes, plugged: Plug) -> None:
     device = plugged("one")
-    with connected(f"mti:{device.link}=torso") as source:
+    with connected(mti_source(f"{device.link}=torso")) as source:
         collect(source, 5)
         device.packet = packet
         wait_until(lambda: source.read(0.05) is not None and source.problems)

@@ -13,8 +13,7 @@ from sampling import find_free_port
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import BadSource
-from wepose_pin.live.sources import open_source
-from wepose_pin.live.sources.base import Source
+from wepose_pin.live.sources import Source, open_source
 
 # Packets as a tracker sends them; rotation and acceleration are the worked example of the protocol's description.
 MAC = bytes.fromhex("4c11ae0000a1")

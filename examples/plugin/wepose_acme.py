@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from wepose_pin.live import Output
-from wepose_pin.live.sources.base import SourceKind
+from wepose_pin.live.sources import SourceKind
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.readers import load_session, registry
 from wepose_pin.readers.device import Signal, make_device

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ..live import Output, SensorSetup, SessionSummary
     from ..live.page import LivePage
     from ..live.robot import RobotOutput
-    from ..live.sources.base import Source
+    from ..live.sources import Source
 
 GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
 
@@ -93,7 +93,7 @@ def live(
     Parameters
     ----------
     source
-        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,... or slimevr:[HOST]
+        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, slimevr:[HOST] or a plug-in
         (docs/live-sources.md). Without HOST only this machine can send.
     subject
         SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it.

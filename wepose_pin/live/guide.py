@@ -39,8 +39,8 @@ from ..simulation import simulate
 from ..writers.calibration import write_calibration
 from ..writers.provenance import collect_provenance, result_folder
 from .setup import AssignedSource, SensorSetup, rename_sensors, write_segments
-from .sources.base import Source
-from .state import Action, GuideStep, GuideView, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
+from .sources import Source
+from .state import Action, GuideView, LivePose, Output, SensorStatus, Stage, Status, StepState, StreamInfo, join_names
 from .ticks import Recorder, SensorMonitor
 
 STATURE = "stature"  # that may be measured in place of a length
@@ -108,7 +108,7 @@ def choose_parts(protocol: str, phases: Collection[str]) -> str:
 StepRun = Generator[GuideView, Action | None, str]
 
 
-class Step(NamedTuple):
+class GuideStep(NamedTuple):
     """A step of the guide; `run` is told whether the step was asked for, and does not just follow the one before."""
 
     name: str
@@ -128,7 +128,7 @@ class Guide(Stage):
     STATUS_PERIOD_S = 0.1  # [s]
 
     def __init__(
-        self, source: Source, options: GuideOptions, steps: Sequence[Step], outputs: Sequence[Output] = ()
+        self, source: Source, options: GuideOptions, steps: Sequence[GuideStep], outputs: Sequence[Output] = ()
     ) -> None:
         super().__init__(source, outputs)
         self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor(source)
@@ -147,7 +147,7 @@ class Guide(Stage):
         self._begin(steps[0].name)
 
     @property
-    def step(self) -> Step:
+    def step(self) -> GuideStep:
         return self.steps[self._index]
 
     @property
@@ -244,7 +244,7 @@ class Guide(Stage):
 
     def view(self) -> GuideView:
         states = ["done"] * self._index + ["now"] + ["ahead"] * (len(self.steps) - self._index - 1)
-        steps = tuple(GuideStep(step.name, step.title, state) for step, state in zip(self.steps, states, strict=True))
+        steps = tuple(StepState(step.name, step.title, state) for step, state in zip(self.steps, states, strict=True))
         problem = "" if self.attempt is None else self.attempt.log.problem
         return self._view._replace(note=self._view.note or problem, steps=steps)
 

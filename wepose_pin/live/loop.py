@@ -34,7 +34,7 @@ from ..tracking.heading_filter import CAUSAL_KNOT_S
 from ..writers.live_log import check_absent
 from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts
-from .sources.base import Source
+from .sources import Source
 from .sources.replay import ReplaySource
 from .state import QUIT, Action, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
 from .ticks import Recorder, SensorMonitor, StartPoseSearch, check_units

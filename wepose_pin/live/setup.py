@@ -18,7 +18,7 @@ from ..errors import BadSession
 from ..readers.session import SensorKeys, read_head, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from ..recording.arrivals import Samples
-from .sources.base import Source
+from .sources import Source
 from .sources.replay import ReplaySource
 
 SETUP_FILE = "setup.toml"

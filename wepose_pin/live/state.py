@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..recording.arrivals import Samples
-from .sources.base import Source
+from .sources import Source
 
 LONGEST_TEXT = 120  # letters that a person may type
 
@@ -80,7 +80,7 @@ class Request(NamedTuple):
 QUIT = Request("quit")
 
 
-class GuideStep(NamedTuple):
+class StepState(NamedTuple):
     """A step of the guided session; one that is done is an action of this name."""
 
     name: str
@@ -96,7 +96,7 @@ class GuideView(NamedTuple):
     countdown: float | None = None  # [s] until it begins, or until the start pose was held
     remaining: float | None = None  # [s] of motion that are left
     progress: float = 0.0  # 0 to 1 of this step
-    steps: tuple[GuideStep, ...] = ()
+    steps: tuple[StepState, ...] = ()
     actions: tuple[Action, ...] = ()  # of this step; the first is the usual one
     highlight: str = ""  # segment to draw apart from the others
     demonstration: str = ""  # phase of the protocol to draw; empty: the start pose

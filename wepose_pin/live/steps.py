@@ -13,17 +13,17 @@ import numpy as np
 
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol
-from ..calibration.protocols import Step as ProtocolStep
+from ..calibration.protocols import Step
 from ..calibration.result import format_longest
 from ..diagnostics import join_text, render, render_all
 from ..errors import BadData, BadOption, ExistingOutput, WeposeError
 from ..recording import check_recording
 from ..recording.arrivals import unpack_orientations
 from ..tracking.start_pose import StartPoseDetector
-from .guide import STATURE, Guide, GuideOptions, Step, StepRun
+from .guide import STATURE, Guide, GuideOptions, GuideStep, StepRun
 from .loop import open_and_wait, warm_up
 from .setup import AssignedSource, SensorSetup
-from .sources.base import Source
+from .sources import Source
 from .state import Action, GuideView, Output, join_names
 from .ticks import Recorder, check_units
 
@@ -81,17 +81,17 @@ def run_guide(
     return guide.assign_source(), replace(options.setup, subject=subject, remounted=False, mounts={})
 
 
-def make_steps(protocol: Protocol) -> list[Step]:
+def make_steps(protocol: Protocol) -> list[GuideStep]:
     """The table of steps of a guided session with the motions of this protocol."""
     motions = [step for step in protocol.steps if step.phase != "start"]
     if not motions:
         raise BadOption(f"--protocol {protocol.name}: has no motion that --guide could lead through; name another one")
     return [
-        Step("sensors", "Sensors", find_sensors, before_attempt=True),
-        Step("assignment", "Segments", assign_segments, before_attempt=True),
-        Step("start", "Start pose", hold_start_pose),
-        *(Step(m.phase, m.phase.replace("_", " ").capitalize(), partial(perform_motion, m)) for m in motions),
-        Step("quality", "Result", show_result, records=False),
+        GuideStep("sensors", "Sensors", find_sensors, before_attempt=True),
+        GuideStep("assignment", "Segments", assign_segments, before_attempt=True),
+        GuideStep("start", "Start pose", hold_start_pose),
+        *(GuideStep(m.phase, m.phase.replace("_", " ").capitalize(), partial(perform_motion, m)) for m in motions),
+        GuideStep("quality", "Result", show_result, records=False),
     ]
 
 
@@ -210,7 +210,7 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
 # The motion ----------------------------------------------------------------------------------------------------------
 
 
-def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepRun:
+def perform_motion(motion: Step, guide: Guide, asked_for: bool) -> StepRun:
     """Record a phase of the protocol; the person sees what it has determined. A lost sensor needs the start pose."""
     attempt, phase, target_s = guide.begin_attempt(), motion.phase, motion.seconds
     if asked_for and motion is find_longest(guide.options.joined):
@@ -255,7 +255,7 @@ def perform_motion(motion: ProtocolStep, guide: Guide, asked_for: bool) -> StepR
             attempt.mark("end", phase=phase, time=attempt.newest)
 
 
-def find_longest(protocol: Protocol) -> ProtocolStep:
+def find_longest(protocol: Protocol) -> Step:
     """The motion of which more may be wanted."""
     return max((step for step in protocol.steps if step.phase != "start"), key=lambda step: step.seconds)
 

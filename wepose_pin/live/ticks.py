@@ -21,7 +21,7 @@ from ..recording.plausibility import check_signals, find_unseen_rate
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
-from .sources.base import MAX_VALUES, Source
+from .sources import MAX_VALUES, Source
 from .state import join_names
 
 WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity

@@ -32,7 +32,7 @@ from .device import Device, DeviceSensor
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "wepose-live"
 HEADER, SENSORS, EVENTS, POSES = "wepose", "/sensors/", "/events", "/pose"  # name of the metadata, and topics
-FORMAT = 3  # of the header
+FORMAT = 4  # of the header
 LONGEST_RECORD = 1 << 28  # [bytes] longer than any that we write
 MOST_RATE = 10_000.0
 LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text

@@ -18,7 +18,7 @@ from ...errors import BadSource, how_to_install, one_of
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 from ...recording.arrivals import Samples
 from ..state import join_names
-from .base import Source, SourceKind, SourceOptions
+from . import Source, SourceKind, SourceOptions
 
 THIS_MACHINE = (
     "[log]\nlevel = -3\n[ports]\nIPv6 = disable\n[multicast]\nResolveScope = machine\nListenAddress = 127.0.0.1\n"

@@ -13,7 +13,7 @@ from ...errors import BadOption
 from ...readers import load_session
 from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
-from .base import Source, SourceKind, SourceOptions
+from . import Source, SourceKind, SourceOptions
 
 MIN_SLEEP_S = 0.0005  # up to 1 kHz every sample comes when it is due, faster ones come together
 

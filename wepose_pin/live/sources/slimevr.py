@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...recording.arrivals import Samples, pack_orientations
-from .base import SourceKind, SourceOptions
+from . import SourceKind, SourceOptions
 from .udp import LOOPBACK, DatagramSource, parse_address
 
 PORT = 6969

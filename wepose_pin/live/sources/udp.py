@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import BadOption, BadSource, one_of
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 from ...recording.arrivals import Samples
-from .base import MAX_TIME, HostClock, Source, SourceKind, SourceOptions
+from . import MAX_TIME, HostClock, Source, SourceKind, SourceOptions
 
 LOOPBACK = "127.0.0.1"
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
