@@ -1,4 +1,4 @@
-"""Where the right hand is, of `wepose live … --udp 9001`; waits for ever, ends by Ctrl-C."""
+"""Where the right hand is, of `wepose live … --output udp:9001`; waits for ever, ends by Ctrl-C."""
 
 import contextlib
 import json

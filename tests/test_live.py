@@ -454,4 +454,5 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording
     source = ReplaySource(recording, math.inf)
     ended = live.run_session(source, setup, record="/dev/full", force=True)
     assert ended.poses > 2000
-    assert "the recording ended: No space left" in ended.problem
+    (incomplete,) = (each for each in ended.diagnostics if each.code == "file-incomplete")
+    assert "the recording ended: No space left" in str(incomplete.facts["reason"])

@@ -47,7 +47,7 @@ def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_pa
         listening.bind(("127.0.0.1", 0))
         listening.settimeout(600.0)  # a new clone compiles first
         command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"replay:{session}", "--no-page"]
-        command += ["--record", str(file), "--speed", str(SPEED), "--udp", str(listening.getsockname()[1])]
+        command += ["--record", str(file), "--speed", str(SPEED), "--output", f"udp:{listening.getsockname()[1]}"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         shown = {}
         while len(shown) < 400:
@@ -120,7 +120,7 @@ def test_wrong_options_are_one_line(session: Path, tmp_path: Path, capsys: pytes
         (["--source", replay, "--record", str(file)], "there.mcap: exists; --force replaces it"),
         (["--source", replay, "--record", str(tmp_path / "no" / "a.mcap")], "a.mcap: cannot be written"),
         (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file"),
-        (["--source", replay, "--udp", "somewhere"], "--udp somewhere: a port or HOST:PORT is needed"),
+        (["--source", replay, "--output", "udp:somewhere"], "--output udp: somewhere: a port or HOST:PORT is needed"),
         (["--source", replay, "--output", "osc:9000"], "--output osc:9000: 'osc' is none; there is: lsl, udp"),
         (["--source", replay, "--port", "70000"], "127.0.0.1:70000: an address and a port from 1 to 65535"),
         (["--source", replay, "--method", "smoother"], "smoother"),

@@ -104,7 +104,7 @@ def test_a_hundred_poses_a_second_on_average(receiver: socket.socket, rate_hz: f
 
 @pytest.mark.parametrize("to", ["here", "127.0.0.1:http", "70000", "no such host:9001"])
 def test_wrong_addresses(to: str) -> None:
-    with pytest.raises(BadOption, match=r"--udp .*: (no host|a port or HOST:PORT)"):
+    with pytest.raises(BadOption, match=r"--output udp: .*: (no host|a port or HOST:PORT)"):
         UdpOutput(to)
 
 

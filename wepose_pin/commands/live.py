@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
 
@@ -23,7 +23,6 @@ from .options import (
     LiveMethod,
     Measured,
     Model,
-    Name,
     Number,
     Out,
     ProtocolName,
@@ -39,22 +38,14 @@ from .stopping import stop_requests
 
 if TYPE_CHECKING:
     from ..body import BodyModel
-    from ..live import Output, SensorSetup, SessionSummary
+    from ..live import Output, SessionSummary
     from ..live.page import LivePage
     from ..live.robot import RobotOutput
-    from ..live.sources import Source
 
 GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
 
 
-class Live(NamedTuple):
-    """What came of `live`."""
-
-    session: SessionSummary | None  # None: the guided session was ended before tracking
-    robot: RobotOutput | None
-
-
-@described_by("tracking/__init__.py:track")
+@described_by("tracking/__init__.py:track", "calibration/procedure.py:calibrate")
 def live(
     *,
     source: Annotated[str, Parameter(metavar="SOURCE")],
@@ -65,9 +56,7 @@ def live(
     out: Out | None = None,
     record: File | None = None,
     robot: Robot | None = None,
-    udp: Address | None = None,
-    lsl: Name | None = None,
-    output: Annotated[tuple[str, ...] | None, Parameter(metavar="NAME:ARGUMENT"), MORE] = None,
+    output: Annotated[tuple[str, ...] | None, Parameter(metavar="NAME:ARGUMENT")] = None,
     page: bool = True,
     open: bool = True,
     force: Force = False,
@@ -81,7 +70,7 @@ def live(
     speed: Annotated[Speed, MORE] = "1",
     accept_failed: Annotated[bool, MORE] = False,
     method: Annotated[LiveMethod, RESEARCH] = "amekf",
-) -> Live:
+) -> None:
     """Track a person live: show the pose in the browser and the terminal, send it to programs or a robot, record it.
 
     Stand still in the start pose until the message says that it is ready. After that, stand in the start pose again and
@@ -102,8 +91,7 @@ def live(
     setup
         Take from this folder, of an earlier --guide, which sensor sits on which segment.
     guide
-        Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality
-        (docs/live.md). Needs no subject and no session.
+        Lead through the calibration first (docs/live.md). Needs no subject and no session.
     out
         With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
         named by the date.
@@ -111,130 +99,99 @@ def live(
         Write all that is received and the poses to this file, and let takes and moments be marked in it by keys;
         `wepose track FILE` gives the same poses again.
     robot
-        Send joint commands that let this robot follow the person (docs/live-outputs.md): one of the names of `wepose
-        retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), the robot map, or a TOML file that
-        names one of these and says how it follows: the arm, the UDP port, the rate, margins and timeouts. First bring
-        the robot into the rest posture of its robot map.
-    udp
-        Send each pose as JSON to this UDP port (docs/live-outputs.md). Without HOST to this machine.
-    lsl
-        Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
+        Send joint commands that let this robot, as of `wepose retarget --robot`, follow the person, or the robot that a
+        TOML file names with arm, UDP port, rate, margins and timeouts (docs/live-outputs.md). First bring the robot
+        into the rest posture of its robot map.
     output
-        Send each pose by this output, of this package (udp, lsl) or of a plug-in, with its argument, such as udp:9001;
-        may be given several times.
+        Send each pose to udp:[HOST:]PORT as JSON, to lsl:NAME as a stream of the Lab Streaming Layer, or to the output
+        of a plug-in (docs/live-outputs.md); may be given several times.
     page
         Serve the page that shows the pose (which only this machine can open).
     open
         Open the page in the browser.
-    stature
-        With --guide: narrow the population prior to people of this body height.
-    sex
-        With --guide: narrow the population prior to women or men.
     measured
-        With --guide: use this measured length, such as shoulder_width=0.385; may be given several times.
+        May be given several times.
     protocol
-        With --guide: calibrate by this protocol, as `wepose calibrate`. Without it clasp+t_pose, and a bow after them
-        for sensors that measure orientations and no accelerations where no session states the torso's mount.
+        In the guide without it: clasp+t_pose, and a bow too for sensors that measure orientations and no accelerations
+        where no session states the torso's mount.
     host
         Serve the page on this address of this machine, such as 0.0.0.0 for all, to open it on a phone. Its URL then
-        holds a token, without which nobody can open it. Without --host this machine alone can open the page.
+        holds a token, without which nobody can open it.
     port
         Serve the page at this port; 0 takes any that is free.
     speed
-        With --source replay: replay at this speed; 1 is that of the recording, 4 is four times that, max is as fast as
-        possible.
+        With --source replay: replay at this multiple of the recording's own speed; max is as fast as possible.
     """
-    from ..body.subject import load_subject
-    from ..calibration import load_protocol
-    from ..calibration.protocols import GUIDED
     from ..compilation import announce_compilation
     from ..live import find_setup, open_source, run_session
     from ..live.guide import GuideOptions, choose_protocol
-    from ..live.loop import warm_up
     from ..live.robot import RobotOutput, read_robot
-    from ..live.setup import build_subject_model, check_mounts, read_segments
+    from ..live.setup import AssignedSource, build_subject_model, check_mounts, read_segments
     from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView
-    from ..retargeting.targets import check_person_arms
 
     for option, value in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if value is not None and not guide:
             raise BadOption(f"--{option}: goes with --guide, which is not given")
-    usual = {"udp": udp, "lsl": lsl}
-    senders = [f"{name}:{value}" for name, value in usual.items() if value is not None] + list(output or ())
     announce_compilation()  # a stream is waiting
     # A wrong robot is found before the person does anything.
     commands, receiver = (None, "") if robot is None else read_robot(robot)
-    if commands is not None and guide:
-        check_person_arms(commands.robot, load_protocol(protocol or GUIDED).needs)
-    if subject is not None and not accept_failed:
-        load_subject(subject).check_quality()
     replays = source.startswith("replay:")
     samples = open_source(source, speed=speed) if replays else None
     worn = find_setup(samples, subject, session, model)
+    if worn.subject is not None and not accept_failed:
+        worn.subject.check_quality()
     body = build_subject_model(worn, () if samples is None else samples.sensors)
-    samples = samples or _open_stream(source, worn, body, setup, guide)
+    segments = tuple(body.table.segments)
+    assigned = {} if setup is None else read_segments(setup, segments)
+    if samples is None and assigned and not guide:
+        stream = open_source(source, sensors=tuple(assigned), segments=tuple(assigned))
+        samples = AssignedSource(stream, assigned, segments)
+    elif samples is None:
+        names = None if guide else tuple(worn.mounts) or None
+        samples = open_source(source, sensors=names, segments=segments, any_name=guide)
     if not guide:
-        check_mounts(samples, worn)  # before the page opens
+        check_mounts(samples, worn)
     print_diagnostics(body.diagnostics)
     outputs: list[Output] = [TerminalView(keyboard=Keyboard())]
     driven: RobotOutput | None = None
-    served = _open_page(body, out.absolute().name if out is not None else worn.name, host, port, open) if page else None
-    if served is not None:
-        outputs.insert(0, served)
+    served: LivePage | None = None
     try:
+        for text in output or ():
+            name, _, argument = text.partition(":")
+            if name not in find_plugins("outputs"):
+                raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
+            outputs.append(load_plugin("outputs", name)(argument))
+        folder = _make_guide_folder(out, force) if guide else Path()
+        if page:
+            served = _open_page(body, worn.name if out is None else out.absolute().name, host, port, open)
+            outputs.insert(0, served)
         with stop_requests() as should_stop:
             if guide:
-                folder = _make_guide_folder(out, force)
-                options = GuideOptions(
-                    folder,
-                    worn,
-                    body,
-                    protocol or choose_protocol(samples, worn, body),
-                    method,
-                    measured or {},
-                    stature,
-                    sex,
-                    subject,
-                    {} if setup is None else read_segments(setup, tuple(body.table.segments)),
-                )
+                task, known = protocol or choose_protocol(samples, worn, body), measured or {}
+                options = GuideOptions(folder, worn, body, task, method, known, stature, sex, subject, assigned)
                 guided = run_guide(samples, options, outputs, should_stop)
                 if guided is None:
                     say("The guided session was ended before a calibration was accepted.")
-                    return Live(None, None)
+                    return
                 (samples, worn), paths = guided, (folder / f"session-{number}.mcap" for number in itertools.count(1))
                 record = record or next(path for path in paths if not path.exists())
                 body = build_subject_model(worn, samples.sensors)
             if commands is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
                 driven = RobotOutput(commands, receiver, samples.sensors, worn.subject, body.table, factor)
+                outputs.insert(0, driven)
                 if not commands.checks_contact:
                     print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
-            if served is not None and driven is not None:
-                served.set_body(body, driven.robot, driven.read_position)
-            elif served is not None and guide:
-                served.set_body(body)
-            outputs += _open_senders(senders)
-            if driven is not None:
-                outputs.insert(0, driven)
-                warm_up(method)  # compiles before commands are due
-                driven.open()
+            if served is not None and (guide or driven is not None):
+                served.set_body(body, driven)
             summary = run_session(
-                samples,
-                worn,
-                method=method,
-                model=body,
-                record=record,
-                force=force,
-                outputs=outputs,
-                until=should_stop,
+                samples, worn, method=method, model=body, outputs=outputs, until=should_stop, record=record, force=force
             )
     finally:
         for each in outputs:
             each.close()
-    ended = Live(summary, driven)
-    _print_end(ended, record)
-    return ended
+    _print_end(summary, driven, record)
 
 
 def _make_guide_folder(out: Path | None, force: bool) -> Path:
@@ -243,17 +200,16 @@ def _make_guide_folder(out: Path | None, force: bool) -> Path:
         raise ExistingOutput(f"{folder}: holds a subject; --force replaces it, -o names another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise ExistingOutput(f"{folder}: cannot be made: {error.strerror}") from error
+        raise ExistingOutput(f"{folder}: cannot be written: {error.strerror}; -o names another folder") from error
     return folder
 
 
-def _print_end(ended: Live, record: Path | None) -> None:
+def _print_end(session: SessionSummary, robot: RobotOutput | None, record: Path | None) -> None:
     """What was tracked, what the robot did, and what was recorded."""
     import numpy as np
 
-    session, robot = ended.session, ended.robot
-    assert session is not None
     print_diagnostics(session.diagnostics)
     title = "no poses: the start pose was not held"
     if session.poses:
@@ -274,31 +230,15 @@ def _print_end(ended: Live, record: Path | None) -> None:
         title = f"{name}: {count} commands; with a pose {shares or 'none'}"
         print_table(title, ("arm", "hand off its target [mm]", "in 90 % under"), rows)
         print_diagnostics(robot.diagnostics)
-    if session.problem:
-        facts = {"variant": "disk", "reason": session.problem}
-        print_diagnostics([Diagnostic("file-incomplete", WARNING, str(session.record), facts=facts)])
-    elif session.record is not None:
+    if session.record is not None:
         say(f"Recorded: {session.record}  (wepose track {session.record} -o DIR gives these poses again)")
     elif record is not None:
         say(f"Nothing was recorded to {record}: without the start pose there is nothing to track.")
 
 
-def _open_stream(source: str, worn: SensorSetup, model: BodyModel, folder: Path | None, guide: bool) -> Source:
-    """The source of a stream, not yet opened; with the segments of an earlier guide's `folder`."""
-    from ..live import open_source
-    from ..live.setup import AssignedSource, read_segments
-
-    sensors, segments = list(worn.mounts), list(model.table.segments)
-    if guide:
-        return open_source(source, segments=segments, any_name=True)
-    if folder is None:
-        return open_source(source, sensors=sensors or None, segments=segments)
-    assigned = read_segments(folder, segments)
-    return AssignedSource(open_source(source, sensors=list(assigned), segments=list(assigned)), assigned, segments)
-
-
 def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_browser: bool) -> LivePage:
-    """Serve the page, and say where."""
+    import webbrowser
+
     from ..live.page import LivePage
     from ..live.sources.udp import LOOPBACK
 
@@ -306,19 +246,6 @@ def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_bro
     page.open()
     everybody = "whoever has this address can watch and press the page's buttons"
     say(f"Page: {page.url}  ({everybody if page.token else 'this machine only'})")
-    if in_browser:
-        import webbrowser
-
-        if not webbrowser.open(page.url):
-            say("No browser could be started: open the page yourself.")
+    if in_browser and not webbrowser.open(page.url):
+        say("No browser could be started: open the page yourself.")
     return page
-
-
-def _open_senders(named: Sequence[str]) -> list[Output]:
-    senders: list[Output] = []
-    for text in named:
-        name, _, argument = text.partition(":")
-        if name not in find_plugins("outputs"):
-            raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
-        senders.append(load_plugin("outputs", name)(argument))
-    return senders

@@ -22,7 +22,7 @@ from ..body.mounts import compute_start_configuration
 from ..body.soft_tissue import make_correction
 from ..body.subject import parse_subject
 from ..body.table import check_segments
-from ..diagnostics import Diagnostic
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
 from ..readers.live_log import LONGEST_TEXT
@@ -60,7 +60,6 @@ class SessionSummary(NamedTuple):
     counts: Mapping[str, Mapping[str, int]] = {}  # segment → each of `arrivals.COUNTS`
     latency: np.ndarray = np.empty(0)  # (n,) [s] of the newest ticks with a sample, from its time to its pose
     diagnostics: tuple[Diagnostic, ...] = ()
-    problem: str = ""  # of the recording; empty where it is complete
     record: Path | None = None  # the recording
 
 
@@ -139,6 +138,9 @@ class LiveLoop(Stage):
             finally:
                 for output in self.outputs:
                     output.close()
+        if self.log.problem:
+            facts = {"variant": "disk", "reason": self.log.problem}
+            self._diagnostics += (Diagnostic("file-incomplete", WARNING, str(self.log.path), facts=facts),)
         rows = zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True)
         counts = {name: dict(zip(COUNTS, row, strict=True)) for name, row in rows}
         return SessionSummary(
@@ -147,7 +149,6 @@ class LiveLoop(Stage):
             counts,
             np.array(self._latency),
             self._diagnostics,
-            self.log.problem,
             self.log.path,
         )
 

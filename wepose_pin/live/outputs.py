@@ -56,7 +56,7 @@ class UdpOutput(Output):
     """Sends each pose as JSON in a datagram of its own, `RATE_HZ` a second at most; parameter as of `UdpSender`."""
 
     def __init__(self, to: str) -> None:
-        self._sender, self._due = UdpSender(to, "--udp", PORT), -np.inf
+        self._sender, self._due = UdpSender(to, "--output udp:", PORT), -np.inf
         self._info: StreamInfo | None = None
 
     def start(self, info: StreamInfo) -> None:

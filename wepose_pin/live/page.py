@@ -25,9 +25,9 @@ import secrets
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from ipaddress import IPv4Address
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -40,11 +40,13 @@ from ..body.configuration import KinematicsSolver
 from ..body.links import find_known_links
 from ..errors import BadOption
 from ..report.viewer import DARK, LIGHT, choose_trail_colour, fill_page, find_floor, scene, view
-from ..retargeting.robot import Robot
 from ..retargeting.targets import find_person_arm
 from ..retargeting.visuals import MeshPart, build_parts, place_beside_person
 from .sources.udp import LOOPBACK, name_host
 from .state import QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
+
+if TYPE_CHECKING:
+    from .robot import RobotOutput
 
 FINGERS = 0.1  # [m] beyond the end of a limb
 DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.6, 0.8]])
@@ -97,11 +99,9 @@ class LivePage(Output):
         self._thread = threading.Thread(target=asyncio.run, args=(self._serve(listening),), daemon=True)
         self._thread.start()
 
-    def set_body(
-        self, model: BodyModel, robot: Robot | None = None, position: Callable[[], np.ndarray | None] = lambda: None
-    ) -> None:
-        """Draw this body from now on, and a robot beside it at its joint `position`; browsers load the page again."""
-        encoder = PoseEncoder(model, robot, position)
+    def set_body(self, model: BodyModel, driven: RobotOutput | None = None) -> None:
+        """Draw this body from now on, and beside it the robot that is driven; browsers load the page again."""
+        encoder = PoseEncoder(model, driven)
         self.html, self.encoder = _fill_page(model, encoder, self._title), encoder
 
     def demonstrate(self, pose: LivePose, info: StreamInfo) -> None:
@@ -174,14 +174,9 @@ class LivePage(Output):
 
 
 class PoseEncoder:
-    """Encodes poses for the page, and beside the person a robot at the joint positions that `position` gives now.
+    """Encodes poses for the page, and beside the person the robot in the posture of its newest command."""
 
-    Where that is None, the robot is at rest.
-    """
-
-    def __init__(
-        self, model: BodyModel, robot: Robot | None = None, position: Callable[[], np.ndarray | None] = lambda: None
-    ) -> None:
+    def __init__(self, model: BodyModel, driven: RobotOutput | None = None) -> None:
         self.identity = secrets.token_hex(8)  # of the page that draws its frames
         self.visuals = [visual for visual in model.visuals if visual.kind != "mesh"]
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
@@ -198,9 +193,9 @@ class PoseEncoder:
         for first, *_, last in draw.limbs:  # in front, at the sides and up
             if last in draw.paths:
                 self.reach.append(p_W[first] + (np.linalg.norm(p_W[last] - p_W[first]) + FINGERS) * DIRECTIONS)
-        self._robot, self._position = robot, position
-        self._robot_joints, self.meshes = list[int](), list[MeshPart]()
-        if robot is not None:
+        self._driven, self._robot_joints, self.meshes = driven, list[int](), list[MeshPart]()
+        if driven is not None:
+            robot = driven.robot
             self.meshes = build_parts(robot)
             heights = [p_W[find_person_arm(model.table, arm.side).points[0]][2] for arm in robot.arms]
             self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
@@ -245,10 +240,10 @@ class PoseEncoder:
 
     def _place_robot(self) -> np.ndarray:
         """Rotation row by row and position [m] of each link of the robot in W, (links, 12)."""
-        if self._robot is not None:
-            position = self._position()
-            configuration = self._robot.configuration(self._robot.rest if position is None else position)
-            pin.forwardKinematics(self._robot.model, self._robot_data, configuration)
+        if self._driven is not None:
+            robot, newest = self._driven.robot, self._driven.newest
+            configuration = robot.configuration(robot.rest if newest is None else newest.u)
+            pin.forwardKinematics(robot.model, self._robot_data, configuration)
         return _stack([self._root * self._robot_data.oMi[joint] for joint in self._robot_joints])
 
 

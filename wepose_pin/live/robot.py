@@ -98,6 +98,7 @@ class RobotOutput(Output):
         self._newest = time.monotonic(), pose
 
     def status(self, status: Status) -> None:  # noqa: ARG002
+        self.open()  # it holds from before the start pose
         if self._failure is not None:
             raise self._failure
 
@@ -118,10 +119,6 @@ class RobotOutput(Output):
         if self._thread is not None:
             self._thread.join(PATIENCE_S)
         self._sender.close()
-
-    def read_position(self) -> np.ndarray | None:
-        """(n,) [rad or m] of the newest command; None before the first."""
-        return None if self.newest is None else self.newest.u
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
