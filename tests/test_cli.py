@@ -82,7 +82,11 @@ def test_a_command_and_its_function_share_their_options(name: str, capsys: pytes
 
 @pytest.mark.slow
 def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("demo", "-o", tmp_path, "--seed", 2) == 0
+    (tmp_path / "subject").mkdir()
+    (tmp_path / "subject" / "notes.txt").write_text("")
+    assert run("demo", "-o", tmp_path, "--seed", 2) == 2
+    assert [path.name for path in tmp_path.rglob("*")] == ["subject", "notes.txt"]
+    assert run("demo", "-o", tmp_path, "--seed", 2, "--force") == 0
     text = capsys.readouterr().out
     for word in ("left forearm", "measured", "Quality: pass", "Position error", "view.html"):
         assert word in text

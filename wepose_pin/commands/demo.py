@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from .calibrate import calibrate
@@ -28,13 +29,19 @@ def demo(*, out: Out = Path("wepose-demo"), seed: Seed = 1, force: Force = False
     seed
         Sample the person and the motion by this seed.
     """
-    session, subject, result = (out / name for name in ("session", "subject", "result"))
-    person = simulate(out=session, seed=seed, force=force)
-    say("")
-    lengths = {name: round(metres, 4) for name, metres in person.measured.items()}
-    calibrate(session, measured=lengths, stature=round(person.stature, 2), sex=person.sex, out=subject, force=force)
-    say("")
-    track(session, subject=subject, out=result, force=force)
-    say("")
-    evaluate(result, session, phase="circles")
+    session, subject, result = parts = [out / name for name in ("session", "subject", "result")]
+    new = [folder for folder in (out, *parts) if not folder.exists()]
+    try:
+        person = simulate(out=session, seed=seed, force=force)
+        say("")
+        lengths = {name: round(metres, 4) for name, metres in person.measured.items()}
+        calibrate(session, measured=lengths, stature=round(person.stature, 2), sex=person.sex, out=subject, force=force)
+        say("")
+        track(session, subject=subject, out=result, force=force)
+        say("")
+        evaluate(result, session, phase="circles")
+    except BaseException:
+        for folder in new:  # all parts or none
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
     say(f"Open {result / 'view.html'} to see the motion.")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ..diagnostics import from_json
-from ..errors import reason
 from .options import MORE, RESEARCH, Force, Method, Model, Out, Subject, described_by
 from .output import print_diagnostics, progress_bar, say, say_pages, say_paragraph
 
@@ -68,7 +67,6 @@ def track(
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..report.pages import write_track_pages
-    from ..report.reliance import describe_reliance
     from ..tracking import CHUNK_S, Tracker, TrackSummary, track_chunks
     from ..writers.provenance import collect_provenance, result_folder
     from ..writers.result import write_about, write_poses
@@ -105,11 +103,7 @@ def track(
             provenance = collect_provenance("track", options)
             write_about(folder, summary.last, summary, joint_torques, provenance)
         progress("making the pages", 2 / 3)
-        failures = write_track_pages(out, summary, view=view, report=report)
-        try:
-            reliance = describe_reliance(summary.tracked)
-        except Exception as error:  # the result is complete without it
-            reliance = f"How far the motion can be trusted cannot be said: {reason(error)}"
+        reliance, failures = write_track_pages(out, summary, view=view, report=report)
     content = summary.content
     print_diagnostics(from_json(each) for each in content["diagnostics"])
     lengths = content["subject"]["note"] or content["subject"]["name"]

@@ -1,4 +1,4 @@
-"""The pages of a tracked motion: beside its result, in a saved folder, and in a notebook."""
+"""What a tracked motion is good for, and its pages: beside its result, in a saved folder, and in a notebook."""
 
 from __future__ import annotations
 
@@ -7,37 +7,87 @@ import sys
 import tempfile
 import webbrowser
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 from markupsafe import escape
 
+from ..angles import Angles
+from ..body.links import compute_axis_std
 from ..diagnostics import Diagnostic
 from ..documents import whole_file
+from ..errors import reason
 from ..tracking import TrackResult, TrackSummary, summarize
+from ..tracking.measures import find_samples_after_start, finite_median, measure_reach
 from ..writers.provenance import CALL, collect_provenance, result_folder
 from ..writers.result import write_about, write_poses
 from .page import write_pages
-from .viewer import pose_html
+from .viewer import FRAMES_A_SECOND, compute_angles, pose_html
+from .words import explain_no_covariance, listed, name_tips, plain
 
 FRAME_HEIGHT = 560  # [px] of the view page in a notebook
+MOST_FRAMES_INSIDE = 3000  # of the view inside a report
 
 
 def write_track_pages(
     folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True
-) -> list[Diagnostic]:
-    """Write ``view.html`` and ``report.html`` beside a result; as `write_pages`."""
-    tracked, recording = summary.tracked, summary.tracked.recording
+) -> tuple[str, list[Diagnostic]]:
+    """Write ``view.html`` and ``report.html`` beside a result, as `write_pages`; return what the motion is good for.
 
-    def make_view() -> str:
-        return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name)
+    With it diagnostics of the pages that cannot be made.
+    """
+    tracked, recording = summary.tracked, summary.tracked.recording
+    seconds = max(float(tracked.time[-1] - tracked.time[0]), 1e-3)
+    angles = cache(lambda: compute_angles(tracked.pose))
+
+    @cache
+    def make_view(fps: float = FRAMES_A_SECOND) -> str:
+        return pose_html(
+            tracked.model, tracked.pose, phases=recording.phases, title=recording.name, angles=angles(), fps=fps
+        )
 
     def make_report() -> str:
         from .track import render_track_report  # with it comes matplotlib
 
-        return render_track_report(summary)
+        page = make_view(min(FRAMES_A_SECOND, MOST_FRAMES_INSIDE / seconds))
+        return render_track_report(summary, reliance, angles(), page)
 
+    try:
+        reliance = describe_reliance(tracked, angles())
+    except Exception as error:  # the result is complete without it
+        reliance = f"How far the motion can be trusted cannot be said: {reason(error)}"
     pages = {"view.html": make_view if view else None, "report.html": make_report if report else None}
-    return write_pages(folder, pages)
+    return reliance, write_pages(folder, pages)
+
+
+def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
+    """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
+    after_start, table = find_samples_after_start(tracked), tracked.model.table
+    stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
+    for joint, each in angles.joints.items() if angles is not None else ():
+        for k, angle in enumerate(each.names):
+            name, known = f"{plain(table.shared_name(joint))} {plain(angle)}", after_start & ~each.hidden(k)
+            std = np.nan if each.std is None else float(np.degrees(finite_median(each.std[known, k])))
+            if np.isfinite(std):
+                stds[name] = max(std, stds.get(name, 0.0))
+    hinges = [f"{plain(table.shared_name(hinge))} flexion" for hinge in table.hinges]
+    best = next((name for name in stds if name in hinges), min(stds, key=stds.__getitem__, default=None))
+    worst = max(stds, key=stds.__getitem__, default=None)
+    good = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
+    covs, reaches = tracked.pose.point_cov, measure_reach(tracked.pose, table)
+    tips = [finite_median(compute_axis_std(covs[name])[after_start]) for name in reaches if name in covs]
+    if np.isfinite(tips).any():
+        root = "the root" if table.is_mechanism else "the middle of the hips"
+        good.append(f"{name_tips(table, table.drawn_limbs)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
+    good += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
+    if not good and tracked.pose.segment_cov:  # of a mechanism
+        variances = [np.median(np.diagonal(cov[after_start], 0, 1, 2), 0) for cov in tracked.pose.segment_cov.values()]
+        good = [f"the orientation of each link to ± {np.degrees(np.sqrt(np.max(variances))):.1f}°"]
+    sentences = [f"**Good for** {listed(good)}."] if good else []
+    sentences += [f"Least certain: {worst}, ± {stds[worst]:.0f}°."] if worst not in (best, None) else []
+    sentences += [explain_no_covariance(tracked)] if not (good and tracked.recording.imus) else []
+    return " ".join(sentences)
 
 
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:

@@ -37,42 +37,32 @@ from .figures import (
     styled,
 )
 from .page import Frame, Item, render_page, show_diagnostics
-from .reliance import compute_angles, describe_reliance, explain_no_covariance, name_tips
-from .viewer import MOST_FRAMES_INSIDE, pose_html
-from .words import Table, kinds, listed, number, plain, plural, spread
+from .viewer import compute_angles
+from .words import Table, explain_no_covariance, kinds, listed, name_tips, number, plain, plural, spread
 
 PATH_POINTS = 1000
 VIEWS = (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0))  # axes across and up
 AXES = ("forwards [cm]", "to the left [cm]", "upwards [cm]")
 
 
-def render_track_report(summary: TrackSummary) -> str:
+def render_track_report(summary: TrackSummary, reliance: str, angles: Angles | None, page: str) -> str:
     """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
-    Its size does not grow with the recording's length.
+    Its size does not grow with the recording's length. `reliance` is said first; `page` is the view inside.
     """
-    tracked, measures = summary.tracked, summary
-    recording, table = tracked.recording, tracked.model.table
-    angles = compute_angles(tracked)
+    tracked, recording, table = summary.tracked, summary.recording, summary.tracked.model.table
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
-    page = pose_html(
-        tracked.model,
-        tracked.pose,
-        phases=recording.phases,
-        title=recording.name,
-        most_frames=MOST_FRAMES_INSIDE,
-    )
     return render_page(
         f"Motion of {recording.name or 'a recording'}",
         [
-            describe_reliance(tracked),
+            reliance,
             show_diagnostics(summary.diagnostics, f"**No warnings.** {checked} are within their limits."),
             _describe_recording(tracked),
         ],
         {
-            "What was recorded": _list_recorded(tracked, measures),
+            "What was recorded": _list_recorded(tracked, summary),
             "Drift of the headings": _list_drift(tracked),
-            f"The {name_tips(table, table.drawn_limbs)}": _list_tips(tracked, measures),
+            f"The {name_tips(table, table.drawn_limbs)}": _list_tips(tracked, summary),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
             "The motion in 3D": [Frame(page)],
         },
@@ -229,7 +219,7 @@ def draw_figures(result: TrackResult) -> Figures:
     figures, table = Figures(), result.model.table
     if len(result.time) > 1:
         figures |= draw_tips(result.time, measure_reach(result.pose, table), table)
-    if (angles := compute_angles(result)) is not None:
+    if (angles := compute_angles(result.pose)) is not None:
         figures["angles"] = draw_joint_angles(angles)
     return figures
 

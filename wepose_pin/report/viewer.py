@@ -20,7 +20,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from ..angles import AUTO, joint_angles
+from ..angles import AUTO, Angles, joint_angles
 from ..body import BodyModel, Visual
 from ..body.configuration import solve_configuration
 from ..body.kinematics import Pose
@@ -37,7 +37,7 @@ FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips, of a b
 FEET_Z = -0.6  # [m] below which a point of a person is at a foot
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
 FRAMES_A_SECOND = 30.0
-MOST_FRAMES, MOST_FRAMES_INSIDE = 20_000, 3000  # of a page, and of one inside a report; the browser interpolates
+MOST_FRAMES = 20_000  # of a page; the browser interpolates
 MOST_POSES = 150  # by which the camera is placed
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
 LIGHTS = (  # meshcat's own; positions in W [m]
@@ -56,34 +56,43 @@ Phases: TypeAlias = Mapping[str, Sequence[tuple[float, float]]]  # name → span
 Trails: TypeAlias = Mapping[str, tuple[np.ndarray, str]]  # point → its way (n, 3) [m] in W, may hold NaN; colour in CSS
 
 
+def compute_angles(pose: Pose) -> Angles | None:
+    """Compute the joint angles of a motion; None: it has none."""
+    with contextlib.suppress(BadData):  # no joint has both of its segments
+        return joint_angles(pose, AUTO)
+    return None
+
+
 def pose_html(
     model: BodyModel,
     pose: Pose,
     *,
     phases: Phases = MappingProxyType({}),
     title: str = "",
-    most_frames: int = MOST_FRAMES,
+    angles: Angles | None = None,
+    fps: float = FRAMES_A_SECOND,
 ) -> str:
     """The page that plays `pose` on `model`, with trails of the points whose path is drawn; parameters as `view_html`.
 
     Segments that no sensor measured are drawn rigid with the one above where the model's table says so; what is not
-    known is not drawn.
+    known is not drawn. `angles` are those of `compute_angles`, which are computed where they are missing.
     """
     seconds = max(float(pose.time[-1] - pose.time[0]), 1e-3)
-    frames = frame_indices(pose.time, min(FRAMES_A_SECOND, most_frames / seconds))
+    frames = frame_indices(pose.time, min(fps, MOST_FRAMES / seconds))
     visuals, placed = _place_body(model, pose, frames)
     paths = [name for name in model.table.draw.paths if name in pose.points]
-    angles = {}
-    with contextlib.suppress(BadData):  # no joint has both of its segments
-        for joint, each in joint_angles(pose.cut(frames), AUTO).joints.items():
-            for k, name in enumerate(each.names):
-                angles[plain(f"{joint} {name}")] = np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))
+    angles = angles or compute_angles(pose)
+    shown = {
+        plain(f"{joint} {name}"): np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))[frames]
+        for joint, each in (angles.joints.items() if angles else ())
+        for k, name in enumerate(each.names)
+    }
     return view_html(
         visuals,
         pose.time[frames],
         placed,
         trails={name: (pose.points[name][frames], choose_trail_colour(name, model)) for name in paths},
-        angles=angles,
+        angles=shown,
         phases=phases,
         title=title,
         floor_z=find_floor(model),

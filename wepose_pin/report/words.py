@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..body import BodyTable
+from ..body.mounts import MEASURED_ORIENTATION_STD
+from ..tracking import TrackResult
 
 
 class Table(NamedTuple):
@@ -38,6 +40,24 @@ def kinds(table: BodyTable, names: Iterable[str]) -> list[str]:
     return [plural(name) for name in dict.fromkeys(plain(table.shared_name(name)) for name in names)]
 
 
+def name_tips(table: BodyTable, points: Iterable[str]) -> str:
+    """What these points whose path is drawn are on, as "hands"."""
+    return listed(kinds(table, [(table.drawn_limbs[name].segments or (name,))[-1] for name in points]))
+
+
+def explain_no_covariance(tracked: TrackResult) -> str:
+    """What a ± means, or why there is none, where filter or device state no uncertainty."""
+    if not tracked.recording.imus:
+        return (
+            f"The device states no uncertainty: each ± assumes that its orientations are right to "
+            f"± {np.degrees(MEASURED_ORIENTATION_STD):.0f}° about each axis and that its headings do not drift."
+        )
+    return (
+        f"The filter {tracked.options['method']} states no uncertainty: how far angles and positions may be off is not "
+        "known. The methods amekf, smoother, smekf and smekf_published state it."
+    )
+
+
 def listed(parts: Sequence[str]) -> str:
     """``a, b and c``."""
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
@@ -53,7 +73,7 @@ def number(value: float, digits: int = 1, unit: str = "", sign: str = "", unknow
 
 def spread(std: float, digits: int = 1, unit: str = "") -> str:
     """A standard deviation with its sign and unit."""
-    return f"± {std:.{digits}f}{unit}" if np.isfinite(std) else "not known"
+    return f"± {number(std, digits, unit)}" if np.isfinite(std) else "not known"
 
 
 def plus_minus(value: float, std: float, unit: str = "", digits: int = 1) -> str:
