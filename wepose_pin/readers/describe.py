@@ -23,7 +23,6 @@ from ..data_tables import read_columns, read_first_lines, read_names, read_table
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
-from ..filters.noise import average_blocks
 from ..recording import AXES, CONFIGURATION, ImuSensor, Intervals, Recording, format_span, format_time
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs
@@ -70,8 +69,10 @@ class Description:
 
     def list_sensors(self) -> Iterator[tuple[str, ...]]:
         """List segment, name in the file, signals, peak rate, median specific force and gaps of each sensor."""
-        for segment, sensor in self.recording.sensors.items() if self.recording is not None else ():
-            rate_hz = self.recording.rate_hz if self.recording is not None else 0.0
+        if self.recording is None:
+            return
+        rate_hz = self.recording.rate_hz
+        for segment, sensor in self.recording.sensors.items():
             fastest = np.degrees(np.linalg.norm(compute_rate(sensor, rate_hz), axis=1).max())
             holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
             if isinstance(sensor, ImuSensor):
@@ -160,13 +161,10 @@ def _advise(about: Description, body: BodyTable) -> str:
     """Advise on what to do with the proposed session."""
     if about.recording is None:
         return "mend what cannot be read"
-    sensors = about.recording.sensors
-    then = (
-        "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject; "
-        "or state the mounts and wepose track SESSION -o result"
-    )
-    if all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in sensors.values()):
-        then = "wepose track SESSION -o result"
+    sensors, then = about.recording.sensors, "wepose track SESSION -o result"
+    if not all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in sensors.values()):
+        calibrate = "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject"
+        then = f"{calibrate}; or state the mounts and {then}"
     if not set(sensors) <= set(body.segments):
         then = f"take the # off the lines of each sensor with ? and write its segment in place of SEGMENT; then {then}"
     return then
@@ -213,21 +211,20 @@ def _find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
     size = max(2, round(BLOCK_S * recording.rate_hz))
     static = np.ones(len(recording) // size, dtype=bool)
 
-    def spread(values: np.ndarray, center: np.ndarray) -> np.ndarray:
-        """Return the rms distance (blocks,) of values (n, 3) from the center (blocks, 3) of their block."""
-        off = values[: len(static) * size] - np.repeat(center, size, axis=0)
-        return np.asarray(np.sqrt(average_blocks(off**2, size).sum(axis=1)))
+    def split(values: np.ndarray) -> np.ndarray:
+        return values[: len(static) * size].reshape(len(static), size, *values.shape[1:])
 
     for sensor in recording.sensors.values():
-        rate = compute_rate(sensor, recording.rate_hz)
-        mean = average_blocks(rate, size)
+        rate = split(compute_rate(sensor, recording.rate_hz))
+        mean = rate.mean(axis=1, keepdims=True)
         # A bias is below the rate of a person who rotates evenly.
-        static &= np.linalg.norm(mean, axis=1) < 3.0 * STATIC_GYRO
+        static &= np.linalg.norm(mean[:, 0], axis=1) < 3.0 * STATIC_GYRO
         if isinstance(sensor, ImuSensor):
-            static &= spread(sensor.accel_S, average_blocks(sensor.accel_S, size)) < STATIC_ACCEL
-        static &= spread(rate, mean if isinstance(sensor, ImuSensor) else np.zeros_like(mean)) < STATIC_GYRO
+            static &= split(sensor.accel_S).var(axis=1).sum(axis=1) < STATIC_ACCEL**2
+            rate = rate - mean
+        static &= (rate**2).mean(axis=1).sum(axis=1) < STATIC_GYRO**2
         if sensor.gap is not None:
-            static &= ~sensor.gap[: len(static) * size].reshape(-1, size).any(axis=1)
+            static &= ~split(sensor.gap).any(axis=1)
     spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
     return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
 
@@ -243,20 +240,25 @@ def _relative(path: Path, folder: Path) -> str:
 def _propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) -> Description:
     """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
     format = look_up_format(name)
-    device, lacks_rate = _read(path, name)
+    device = _read(path, name)[0]
     signals = "gyroscope and accelerometer" if device.kind == "raw" else "orientations, no raw data"
     about = Description(path, f"{format.title}, {signals}")
+    files = [path]
     if whole := len(device.sensors) > 1 or format.whole:
         about.data["file"] = _relative(path, folder)
-    else:
+    else:  # those of one recording are in one folder
         about.data["format"] = _relative(Path(name), folder) if name.endswith(".toml") else name
-    for file in [path] if whole else _list_siblings(path, name):
+        own = path.parent if path.is_file() and format.folder and path.suffix.lower() == ".csv" else path
+        siblings = [file for file in _list_files_like(own) if file == own or detect_format(file) == name]
+        files = siblings if path in siblings else [path]
+    for file in files:
         try:
-            device, lacks = _read(file, name)
+            device, lacks_rate = _read(file, name)
         except WeposeError as error:
             about.facts.append(f"{file.name} is left out, as it cannot be read: {error}")
             continue
-        lacks_rate |= lacks
+        if lacks_rate:
+            about.data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, "the file does not say its rate"
         for label, sensor in device.sensors.items():
             names = (label, file.stem) if len(device.sensors) == 1 else (label,)
             guesses = (sensor.segment, *map(body.guess_segment, names))
@@ -264,9 +266,6 @@ def _propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) -
             known = segment is not None and segment not in about.sensors
             where = str(segment) if known else f"?{label if whole else file.name}"
             about.sensors[where] = {"label": label} if whole else {"file": _relative(file, folder)}
-    if lacks_rate:
-        about.data["rate_hz"] = ASSUMED_RATE_HZ
-        about.checks["rate_hz"] = "the file does not say its rate"
     if not whole and len(about.sensors) > 1:
         about.title += f", {len(about.sensors)} files"
     if name == "wepose_live":
@@ -285,18 +284,12 @@ def _read(path: Path, format: str) -> tuple[Device, bool]:
         return read_device(path, format, None, ASSUMED_RATE_HZ), True
 
 
-def _list_siblings(path: Path, format: str) -> list[Path]:
-    """List the file and those of the same format beside it: the files of one recording are in one folder."""
-    own = path.parent if path.is_file() and look_up_format(format).folder and path.suffix.lower() == ".csv" else path
-    siblings = [file for file in _list_files_like(own) if file == own or detect_format(file) == format]
-    return siblings if path in siblings else [path]
-
-
 def _list_files_like(path: Path) -> list[Path]:
     """List the files beside one, of its suffix, or the folders beside one."""
     siblings = [path.parent / file.name for file in sorted(path.absolute().parent.iterdir())]
-    alike = (each for each in siblings if each.is_dir() == path.is_dir() and (each.is_dir() or each.is_file()))
-    return [each for each in alike if path.is_dir() or each.suffix == path.suffix][:MOST_SIBLINGS]
+    if path.is_dir():
+        return [each for each in siblings if each.is_dir()][:MOST_SIBLINGS]
+    return [each for each in siblings if each.is_file() and each.suffix == path.suffix][:MOST_SIBLINGS]
 
 
 # From names of columns or arrays -----------------------------------------------------------------------------------
@@ -323,13 +316,13 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
             about.checks["gyro_unit"] = "neither the file nor the motion says so"
         about.data["accel_unit"] = guess.units.get("accel", "m/s^2")
     for segment, signals in guess.sensors.items():
-        keys = {signal: columns if len(columns) > 1 else columns[0] for signal, columns in signals.items()}
-        about.sensors[segment] = keys
-        if content and "orientation" in keys:
+        about.sensors[segment] = {name: own if len(own) > 1 else own[0] for name, own in signals.items()}
+        if content and "orientation" in signals:
             about.checks["orientation"] = "x, y, z, w? if w comes first, name its columns [1], [2], [3], [0]"
     # A table with one sensor, whose segment is that of the file's name, has others beside it with the same columns.
     own = body.guess_segment(path.stem) if content is None and len(guess.sensors) == 1 else None
-    if own and next(iter(guess.sensors)).startswith("?"):
+    name, keys = next(iter(about.sensors.items()))
+    if own and name.startswith("?"):
         files = {own: path}
         for file in _list_files_like(path):
             other = body.guess_segment(file.stem)
@@ -345,45 +338,46 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
 
 def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) -> None:
     """Propose `time` and its unit, or `rate_hz`; with facts about it."""
-    place = str(about.path)
+    place, data = str(about.path), about.data
     table = arrays.table(dict.fromkeys(guess.times, place)) if arrays else read_table(about.path)
     for name in guess.times:
         with contextlib.suppress(BadData):  # dates, or another column of this name
             time = read_columns(table, [name], place, "time")[:, 0]
             break
     else:
-        dates = table.select(*dict.fromkeys(guess.times))
-        _propose_rate(about, dates, () if arrays else read_first_lines(about.path))
+        if dated := next(filter(None, (_measure_dated_rate(table[name]) for name in guess.times)), None):
+            data["rate_hz"], name = dated
+            about.facts.append(f"'{name}' holds dates; by the first and the last of them: {dated[0]:g} Hz")
+        elif stated := next(
+            filter(None, map(_STATED_RATE.search, () if arrays else read_first_lines(about.path))), None
+        ):
+            data["rate_hz"] = float(stated["rate"])
+            about.facts.append(f"no column looks like time; the file says '{stated[0]}'")
+        else:
+            data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, "no column looks like time"
         return
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     named = guess.units.get(name)
     unit = named if named is not None and 0.0 < step * TIME_UNITS[named] < LONGEST_STEP_S else guess_time_unit(step)
-    about.data["time"] = name
+    data["time"] = name
     if unit not in (None, "s"):
         reason = "its name says" if unit == named else f"it grows by {step:g} from row to row"
         about.facts.append(f"'{name}' is in {unit}, as {reason}: {1.0 / (step * TIME_UNITS[unit]):.4g} Hz")
-        about.data["time_unit"] = unit
+        data["time_unit"] = unit
         if unit != named:
             about.checks["time_unit"] = reason
 
 
-def _propose_rate(about: Description, dates: pl.DataFrame, lines: Sequence[str]) -> None:
-    """Propose the rate of a file without times in numbers: by its dates or times of day, or as a line states it."""
-    for name in dates.columns:
-        texts = dates[name].cast(pl.String).str.strip_chars()
-        for kind, form, tick_s in ((pl.Datetime("us"), None, 1e-6), (pl.Time, "%T%.f", 1e-9)):
-            with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
-                ticks = texts.str.strptime(kind, form, strict=False).cast(pl.Int64).drop_nulls().to_numpy()
-                if len(ticks) and (span := float(np.ptp(ticks)) * tick_s):
-                    rate_hz = about.data["rate_hz"] = float(f"{(len(ticks) - 1) / span:.6g}")
-                    about.facts.append(f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz")
-                    return
-    if stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
-        about.data["rate_hz"] = float(stated["rate"])
-        about.facts.append(f"no column looks like time; the file says '{stated[0]}'")
-    else:
-        about.data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, "no column looks like time"
+def _measure_dated_rate(column: pl.Series) -> tuple[float, str] | None:
+    """Measure the rate [Hz] of a column of dates or times of day, with its name; None: it holds neither."""
+    texts = column.cast(pl.String).str.strip_chars()
+    for kind, form, tick_s in ((pl.Datetime("us"), None, 1e-6), (pl.Time, "%T%.f", 1e-9)):
+        with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
+            ticks = texts.str.strptime(kind, form, strict=False).cast(pl.Int64).drop_nulls().to_numpy()
+            if len(ticks) and (span := float(np.ptp(ticks)) * tick_s):
+                return float(f"{(len(ticks) - 1) / span:.6g}"), column.name
+    return None
 
 
 # Text of the session ---------------------------------------------------------------------------------------------
@@ -423,11 +417,10 @@ def _format_session(about: Description, folder: Path, body: BodyTable, model: Pa
 def _propose_mount(recording: Recording, segment: str, static: Sequence[tuple[float, float]]) -> str:
     """Propose a comment with a mount to complete; gravity shows the axis that points up."""
     sensor = recording.sensors[segment]
-    if not isinstance(sensor, ImuSensor):
-        hint = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
-        return f'# mount = {{ up = "+x", forward = "?" }}   # {hint}'
-    span = recording.span(static[0]) if static else slice(max(1, round(recording.rate_hz)))
-    force = sensor.accel_S[span].mean(axis=0)
-    up = max(AXES, key=lambda axis: float(AXES[axis] @ force))
-    hint = f"up as gravity says {'where it is static' if static else 'in the first second'}"
-    return f'# mount = {{ up = "{up}", forward = "?" }}   # {hint}; write the axis ahead for ?, without the #'
+    up, hint = "+x", "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
+    if isinstance(sensor, ImuSensor):
+        force = sensor.accel_S[recording.span(static[0]) if static else slice(max(1, round(recording.rate_hz)))]
+        up = max(AXES, key=lambda axis: float(AXES[axis] @ force.mean(axis=0)))
+        where = "where it is static" if static else "in the first second"
+        hint = f"up as gravity says {where}; write the axis ahead for ?, without the #"
+    return f'# mount = {{ up = "{up}", forward = "?" }}   # {hint}'

@@ -125,16 +125,6 @@ def convert(path: Path, signal: str, values: np.ndarray, unit: str, column: str)
     return known[guess] * values
 
 
-def spread_equal_times(time: np.ndarray) -> np.ndarray:
-    """Spread equal stamps (n,) evenly up to the next one: samples that one packet brought."""
-    new = np.flatnonzero(np.diff(time, prepend=-np.inf) != 0.0)
-    if len(new) < 2 or len(new) == len(time):
-        return time
-    step = (time[new[-1]] - time[new[0]]) / max(new[-1] - new[0], 1)
-    last = time[new[-1]] + step * (len(time) - new[-1])
-    return np.asarray(np.interp(np.arange(len(time)), [*new, len(time)], [*time[new], last]))
-
-
 def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Join signals of different clocks on that of the first: times (n,) and values by signal.
 
@@ -145,7 +135,7 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
     if all(signal.time is first.time for _, signal in rest):
         return first.time, {name: signal.values for name, signal in signals.items()}
     ((other, second),) = rest
-    (time, rates), (own, forces) = _drop_missing(first), _drop_missing(second)
+    (time, rates), (own, forces) = map(_sort_known, (first, second))
     inside = (time >= own[:1].max(initial=-np.inf)) & (time <= own[-1:].min(initial=np.inf))
     if len(own) < 2 or inside.sum() < 2:
         raise BadData(f"{place}: {name} and {other} have no time in common, of {len(time)} and {len(own)} rows")
@@ -157,11 +147,10 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
     return time, {name: rates, other: joined}
 
 
-def _drop_missing(signal: Signal) -> Signal:
-    """Leave out rows without a time, spread equal stamps, and sort."""
-    known = np.isfinite(signal.time)
-    order = np.argsort(signal.time[known], kind="stable")
-    return Signal(spread_equal_times(signal.time[known][order]), signal.values[known][order])
+def _sort_known(signal: Signal) -> Signal:
+    """Sort by time; rows without one are left out."""
+    order = np.argsort(signal.time, kind="stable")[: np.isfinite(signal.time).sum()]  # NaN are last
+    return Signal(signal.time[order], signal.values[order])
 
 
 @contextmanager

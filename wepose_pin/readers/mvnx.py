@@ -23,18 +23,13 @@ from ..errors import BadData
 from ..libraries import library_errors
 from .device import Device, Reference, Signal, check_measured, make_device
 
-_SIDES = ("Left", "Right")
 SEGMENT_OF = {
     **{"T8": "torso", "LeftUpperArm": "left_upper_arm", "LeftForeArm": "left_forearm"},
     **{"RightUpperArm": "right_upper_arm", "RightForeArm": "right_forearm", "Pelvis": "pelvis", "Head": "head"},
     **{"LeftHand": "left_hand", "RightHand": "right_hand"},
 }
-# The joint in which a segment begins.
-JOINT_OF = {
-    f"{side}{part}": f"{side.lower()}_{joint}"
-    for side in _SIDES
-    for part, joint in (("UpperArm", "shoulder"), ("ForeArm", "elbow"), ("Hand", "wrist"), ("UpperLeg", "hip"))
-}
+_JOINTS = {"UpperArm": "shoulder", "ForeArm": "elbow", "Hand": "wrist", "UpperLeg": "hip"}  # in which a segment begins
+JOINT_OF = {f"{s}{part}": f"{s.lower()}_{joint}" for s in ("Left", "Right") for part, joint in _JOINTS.items()}
 # In the T-pose each of Xsens's frames is one of these, but for the tilts of that pose: 13 deg at the head.
 _QUARTERS = Rotation.create_group("O")
 WIDTH = {"orientation": 4, "position": 3, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
@@ -54,12 +49,11 @@ class Frames(NamedTuple):
 def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """Read the sensors, or the segments' orientations, as `Format.read`; `rate_hz` goes before the file's frameRate."""
     frames = read_frames(path, rate_hz)
-    signals: dict[str, dict[str, Signal]]
     if use != "orientation" and set(RAW) <= set(frames.values):
-        gyro, accel = (frames.values[tag] for tag in RAW)
+        raw = zip(frames.sensors, *(frames.values[tag].swapaxes(0, 1) for tag in RAW), strict=False)
         signals = {
-            label: {"gyro": Signal(frames.time, gyro[:, k]), "accel": Signal(frames.time, accel[:, k])}
-            for k, label in enumerate(frames.sensors)
+            label: {"gyro": Signal(frames.time, gyro), "accel": Signal(frames.time, accel)}
+            for label, gyro, accel in raw
             if label in SEGMENT_OF
         }
     else:
@@ -77,20 +71,15 @@ def read_mvnx_reference(path: Path) -> Reference:
     """Read the segments' orientations and joints as a reference; its world has z up. Errors as `read_mvnx`."""
     frames = read_frames(path)
     quats = {SEGMENT_OF[label]: quat for label, quat in _read_quats(frames).items()}
-    return Reference(frames.time, quats, _find_joints(frames), "+z", diagnostics=_diagnose_frames(path, frames))
+    named = {JOINT_OF[label]: k for k, label in enumerate(frames.segments) if label in JOINT_OF}
+    positions = frames.values.get("position")  # older exports have none
+    joints = {} if positions is None else {joint: positions[:, k] for joint, k in named.items()}
+    return Reference(frames.time, quats, joints, "+z", diagnostics=_diagnose_frames(path, frames))
 
 
 def _diagnose_frames(path: Path, frames: Frames) -> tuple[Diagnostic, ...]:
-    if frames.t_pose is not None:
-        return ()
-    return (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
-
-
-def _find_joints(frames: Frames) -> dict[str, np.ndarray]:
-    """Find the joints, name → (n, 3) [m], as far as the file has positions."""
-    positions = frames.values.get("position")
-    named = {JOINT_OF[label]: k for k, label in enumerate(frames.segments) if label in JOINT_OF}
-    return {} if positions is None else {joint: positions[:, k] for joint, k in named.items()}
+    assumption = Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"})
+    return (assumption,) if frames.t_pose is None else ()
 
 
 def _read_quats(frames: Frames) -> dict[str, np.ndarray]:
@@ -116,42 +105,41 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
     from lxml import etree
 
     labels: dict[str, list[str]] = {"segment": [], "sensor": []}
-    numbers: list[str] = []
-    stamps: list[str] = []
+    frames: list[tuple[str, str]] = []  # index and time of each
     texts: dict[str, list[str]] = {}
     t_pose: list[str] = []
     with library_errors(path, "an MVNX"), path.open("rb") as file:
         # Entities are not expanded and other files not fetched, so that a file cannot grow in memory.
         tags = ("{*}segment", "{*}sensor", "{*}frame", "{*}subject")
         for _, element in etree.iterparse(file, tag=tags, resolve_entities=False, no_network=True, load_dtd=False):
-            name = etree.QName(element).localname
+            name, kind = etree.QName(element).localname, element.get("type", "normal")
             if name in labels and element.get("label"):
                 labels[name].append(element.get("label"))
             elif name == "subject":
                 rate_hz = rate_hz or float(element.get("frameRate", "0"))
             elif name == "frame":
-                if element.get("type", "normal") == "normal":
-                    numbers.append(element.get("index", ""))
-                    stamps.append(element.get("time", ""))
+                if kind == "normal":
+                    frames.append((element.get("index", ""), element.get("time", "")))
                     for tag in WIDTH:
                         if (text := element.findtext(f"{{*}}{tag}")) is not None:
                             texts.setdefault(tag, []).append(text)
-                elif element.get("type") == "tpose":
+                elif kind == "tpose":
                     t_pose = [element.findtext("{*}orientation") or ""]
                 element.clear()
                 while element.getprevious() is not None:
                     del element.getparent()[0]
-    if len(numbers) < 2:
-        raise BadData(f"{path}: {len(numbers)} frames of type 'normal'; a recording has at least 2")
+    if len(frames) < 2:
+        raise BadData(f"{path}: {len(frames)} frames of type 'normal'; a recording has at least 2")
     if "orientation" not in texts:
         raise BadData(f"{path}: its frames hold no <orientation>; export it with the segments' orientations")
     values = {}
     for tag, rows in texts.items():
-        if len(rows) != len(numbers):
-            raise BadData(f"{path}: <{tag}> stands in {len(rows)} of {len(numbers)} frames; it is needed in all")
+        if len(rows) != len(frames):
+            raise BadData(f"{path}: <{tag}> stands in {len(rows)} of {len(frames)} frames; it is needed in all")
         values[tag] = _read_values(path, tag, rows, len(labels["sensor" if tag.startswith("sensor") else "segment"]))
     quats = rotations.xyzw_from_wxyz(_read_values(path, "orientation", t_pose, len(labels["segment"])).reshape(-1, 4))
     has_t_pose = len(quats) > 0 and bool((np.linalg.norm(quats, axis=1) > 0.5).all())
+    numbers, stamps = zip(*frames, strict=True)
     with library_errors(path, "frames with an index and a frameRate, or with a time"):
         if not rate_hz:
             time = 1e-3 * np.array(stamps, dtype=float)

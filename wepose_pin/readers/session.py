@@ -40,11 +40,6 @@ from .registry import detect_format, find_format, read_device
 
 T = TypeVar("T")
 
-# Suffixes of data files.
-DATA = (
-    *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto"),
-    *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".c3d", ".trc"),
-)
 SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
 # Keys of earlier versions, with their replacements.
 _RENAMED_PHASES = {
@@ -59,8 +54,6 @@ NORM_ERROR = 1e-2  # of a quaternion, from rounded decimals
 MOST_LOST = 0.01  # share of samples lost in short gaps, above which it is a diagnostic
 _UNITS = {"time_unit": TIME_UNITS, "gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}
 _CHOICES: dict[str, Collection[str]] = {"use": NEEDED, **_UNITS}
-
-
 _NO_TABLE = TomlTable({}, "")
 
 
@@ -100,9 +93,9 @@ class SensorKeys(NamedTuple):
 def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> TomlTable:
     """Read a session file, or the one in a folder; `values` are its contents where it does not exist yet."""
     path = path / "session.toml" if path.is_dir() else path
-    if path.suffix.lower() in DATA:
+    if path.suffix.lower() != ".toml" and path.is_file():
         written = f"which `wepose info {path.name} --write` writes"
-        raise BadSession(f"{path}: is a table of data by its name; a session file is wanted here, {written}")
+        raise BadSession(f"{path}: is no TOML by its name; a session file is wanted here, {written}")
     top = TomlTable(read_toml(path, "a session file") if values is None else values, str(path))
     top.allow(*SESSION_KEYS)
     return top
@@ -235,6 +228,8 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     head = read_head(top)
     contents: dict[Any, Any] = {}  # of the files, each read once, and their clocks
     devices = {name: _open_device(each, contents) for name, each in keys.items() if not each.signals}
+    # Clocks that start at power-on are shifted together, so that the earliest begins at zero.
+    power_on_s = min((each.begin for each in devices.values() if each.since_power_on), default=0.0)
     alike = len({bool(each.signals) for each in keys.values()}) == 1
     clocks: dict[str, Clock] = {}  # of each sensor, with lost rows filled in
     rows: dict[str, Sensor] = {}  # as its file has them, without lost rows
@@ -243,10 +238,10 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         for key, own in ((key, own) for own in (each.table, *[data] * alike) for key in unused if key in own):
             why = "the columns are named here" if each.signals else "the format of the file defines it"
             raise BadSession(f"{own.at(key)} has no effect, as {why}; remove it")
-        if name in devices:
-            clocks[name], rows[name] = _take_sensor(name, each, devices, contents)
-        else:
+        if each.signals:
             clocks[name], rows[name] = _read_sensor(each, contents)
+        else:
+            clocks[name], rows[name] = _take_sensor(name, each, devices[name], power_on_s, contents)
     places = {name: f"{each.path}: {each.table.place}" for name, each in keys.items()}
     diagnostics = [own for content in contents.values() for own in getattr(content, "diagnostics", ())]
     packets = {id(clock): (keys[name].path.name, clock.packet) for name, clock in clocks.items() if clock.packet > 1}
@@ -298,28 +293,21 @@ def _open_device(keys: SensorKeys, contents: dict[Any, Any]) -> Device:
 
 
 def _take_sensor(
-    segment: str, keys: SensorKeys, devices: Mapping[str, Device], contents: dict[Any, Any]
+    segment: str, keys: SensorKeys, device: Device, power_on_s: float, contents: dict[Any, Any]
 ) -> tuple[Clock, Sensor]:
-    """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor.
-
-    Devices whose clocks start at power-on are shifted together, so that the earliest begins at zero.
-    """
-    path, table, device = keys.path, keys.table, devices[segment]
+    """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor."""
+    path, table = keys.path, keys.table
     labels = [label for label, each in device.sensors.items() if each.segment == segment] or list(device.sensors)
     if keys.label:
         labels = [table.choice("label", device.sensors, keys.label)]
     if len(labels) != 1:
         raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
     sensor = device.sensors[labels[0]]
-    offset_s = keys.offset_s
-    if device.since_power_on:
-        offset_s -= min(each.begin for each in devices.values() if each.since_power_on)
+    offset_s = keys.offset_s - (power_on_s if device.since_power_on else 0.0)
     clock = _once(contents, (path, id(sensor.time), offset_s), build_clock, sensor.time + offset_s, str(path))
-    if keys.mount is None:
-        keys = keys._replace(mount=sensor.mount)
-    if keys.aligned is None:
-        keys = keys._replace(aligned=device.aligned)
-    return clock, _make_sensor(keys, sensor.signals)
+    mount = sensor.mount if keys.mount is None else keys.mount
+    aligned = device.aligned if keys.aligned is None else keys.aligned
+    return clock, _make_sensor(keys._replace(mount=mount, aligned=aligned), sensor.signals)
 
 
 def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sensor]:
@@ -334,17 +322,15 @@ def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sen
             raise BadSession(f"{keys.at(f'{signal}_unit')} is missing; {one_of(known)}")
         units[signal] = known.get(unit, 1.0)
     columns, is_table = dict(keys.signals), not is_array_file(path)
-    for signal in (signal for signal, names in columns.items() if is_table and len(names) == 1):
-        table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
-    if is_table:
-        content = _once(contents, path, read_table, path)
-    else:
-        file = _once(contents, path, ArrayFile, path)
-        for signal, names in columns.items():
-            if len(names) == 1:
-                columns[signal] = file.expand(names[0], WIDTHS[signal], table.at(signal))
+    content: Any = _once(contents, path, read_table if is_table else ArrayFile, path)
+    for signal, names in keys.signals.items():
+        if len(names) == 1 and is_table:
+            table.names(signal, WIDTHS[signal])  # an error: one array, but the file is a table of columns
+        elif len(names) == 1:
+            columns[signal] = content.expand(names[0], WIDTHS[signal], table.at(signal))
+    if not is_table:
         places = {name: table.at(signal) for signal, names in columns.items() for name in names}
-        content = file.table(places | ({keys.time: keys.at("time")} if keys.time else {}))
+        content = content.table(places | ({keys.time: keys.at("time")} if keys.time else {}))
     if keys.rate_hz is not None:
         time, source = np.arange(content.height) / keys.rate_hz, keys.at("rate_hz")
     else:
@@ -352,13 +338,11 @@ def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sen
         time = TIME_UNITS[keys.time_unit] * time
     key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
     clock = _once(contents, key, build_clock, time + keys.offset_s, source)
-    signals = {
-        signal: units[signal] * read_columns(content, names, str(path), table.at(signal))
-        for signal, names in columns.items()
-    }
-    if is_table:  # columns that have been read make room: of a day the table is gigabytes
-        read = [name for names in columns.values() for name in names]
-        contents[path] = content.with_columns(pl.lit(None).alias(name) for name in read)
+    signals = {}
+    for signal, names in columns.items():
+        signals[signal] = units[signal] * read_columns(content, names, str(path), table.at(signal))
+        if is_table:  # columns that have been read make room: of a day the table is gigabytes
+            contents[path] = contents[path].with_columns(pl.lit(None).alias(name) for name in names)
     return clock, _make_sensor(keys, signals)
 
 

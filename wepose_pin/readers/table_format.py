@@ -24,16 +24,7 @@ from ..data_tables import parse_rows, read_body, read_columns, read_first_lines
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import Key, TomlTable, read_record, read_toml
 from ..errors import BadData, BadSession, MissingRate
-from .device import (
-    NEEDED,
-    Device,
-    Signal,
-    check_measured,
-    convert,
-    make_device,
-    open_folder,
-    spread_equal_times,
-)
+from .device import NEEDED, Device, Signal, check_measured, convert, make_device, open_folder
 
 FOLDER = Path(__file__).parent / "formats"
 SEPARATORS = "\t,; "
@@ -76,7 +67,6 @@ class ClockColumn(NamedTuple):
     wraps: Annotated[float | None, Key(most=1e12)] = None  # value at which it begins again at 0
     rate: str = ""  # pattern of the line before the table with the rate of which the column counts the samples
     date: str = ""  # how it is written where it is no number
-    spread: bool = False  # equal times are those of a packet
 
 
 class TableFormat(NamedTuple):
@@ -104,16 +94,15 @@ class TableFormat(NamedTuple):
 
     def detects(self, path: Path, start: str) -> bool:
         """Return whether a file that starts with this text, a folder, or a zip is of the format."""
-        if path.is_file() and path.suffix.lower() != ".zip":
-            matches = [bool(re.search(pattern, start, re.S | re.M)) for pattern in self.detect]
-            # A table with all signals is one that needs no folder.
-            return any(matches) and (len(matches) == 1 or (not all(matches) and self.detects(path.parent, "")))
-        if not self.files:
-            return False
-        with open_folder(path) as files:
-            named = {file for pattern in self.files.values() for file in _select(files, pattern)}
-            starts = ["\n".join(read_first_lines(file, 3)) for file in named]
+        alone = path.is_file() and path.suffix.lower() != ".zip"
+        starts = [start] if alone else []
+        if self.files and not alone:
+            with open_folder(path) as files:
+                named = {file for pattern in self.files.values() for file in _select(files, pattern)}
+                starts = ["\n".join(read_first_lines(file, 3)) for file in named]
         matches = [any(re.search(pattern, text, re.S | re.M) for text in starts) for pattern in self.detect]
+        if alone and len(matches) > 1:  # a table with all signals is one that needs no folder
+            return any(matches) and not all(matches) and self.detects(path.parent, "")
         return bool(matches) and all(matches)
 
     def read(self, path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -156,36 +145,33 @@ def load_format(path: Path) -> TableFormat:
     """Load a description; `WeposeError`: the file is missing, has a wrong key, or a pattern that is none."""
     table = TomlTable(read_toml(path, "a description of tables"), str(path))
     format = read_record(TableFormat, table, others=("files", "clock", *AXES))
-    entries = {signal: [(each, read_record(Columns, each)) for each in table.entries(signal)] for signal in AXES}
     clocks = tuple(read_record(ClockColumn, each) for each in table.entries("clock"))
-    if not clocks or not (entries["orientation"] or (entries["gyro"] and entries["accel"])):
-        raise BadSession(f"{path}: needs [[clock]], and [[gyro]] and [[accel]], or [[orientation]]")
-    keys = table.table("files", {})
-    keys.allow(*NEEDED)
-    patterns = [*format.detect, format.sensor_begins]
-    patterns += [text for clock in clocks for text in (clock.column, clock.rate)]
-    for signal, each in entries.items():
-        for entry, columns in each:
+    patterns = [*format.detect, format.sensor_begins, *(text for each in clocks for text in (each.column, each.rate))]
+    signals: dict[str, tuple[Columns, ...]] = {}
+    for signal in AXES:
+        for entry in table.entries(signal):
+            columns = read_record(Columns, entry)
+            signals[signal] = (*signals.get(signal, ()), columns)
             count, needed = len(columns.columns), ""
             if count not in _COUNTS[signal]:
-                needed = " or ".join("one pattern" if count == 1 else f"{count} names" for count in _COUNTS[signal])
+                needed = " or ".join("one pattern" if n == 1 else f"{n} names" for n in _COUNTS[signal])
             elif count == 1 and "(?P<axis>" not in columns.columns[0]:
                 needed = "a pattern with (?P<axis>...)"
             if needed:
                 raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; needed: {needed}")
             patterns += columns.columns if count == 1 else ()
+    if not clocks or not ("orientation" in signals or {"gyro", "accel"} <= set(signals)):
+        raise BadSession(f"{path}: needs [[clock]], and [[gyro]] and [[accel]], or [[orientation]]")
+    keys = table.table("files", {})
+    keys.allow(*NEEDED)
     for text in patterns:
         try:
             re.compile(text)
         except (re.error, RecursionError, OverflowError) as error:
             raise BadSession(f"{path}: '{text}' is no regular expression: {error}") from None
-    return format._replace(
-        title=format.title or path.stem,
-        needs=format.needs or " and ".join(signal for signal in AXES if entries[signal]),
-        files={kind: keys.text(kind, None) or "" for kind in keys.values},
-        clocks=clocks,
-        signals={signal: tuple(columns for _, columns in each) for signal, each in entries.items()},
-    )
+    title, needs = format.title or path.stem, format.needs or " and ".join(signals)
+    files = {kind: keys.text(kind, None) or "" for kind in keys.values}
+    return format._replace(title=title, needs=needs, files=files, clocks=clocks, signals=signals)
 
 
 @cache
@@ -261,33 +247,31 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: str) -> tuple[list[str], list[str]]:
     """Name the columns of line k, as ``sensor/name/axis`` where these stand in lines of their own; and their units."""
-    own = _split(lines[k], separator)
     offsets = (format.sensors_line, format.axes_line, format.units_line)
-    places = [k + int(offset) if offset else -1 for offset in offsets]
-    owners, axes, units = (_split(lines[n], separator) if 0 <= n < len(lines) else [] for n in places)
-    width = max(len(own), len(axes))
-    own, owners, axes, units = ([*row, *[""] * width][:width] for row in (own, owners, axes, units))
+    places = [k, *(k + int(offset) if offset else -1 for offset in offsets)]
+    rows = [_split(lines[n], separator) if 0 <= n < len(lines) else [] for n in places]
+    width = max(len(rows[0]), len(rows[2]))
+    own, owners, axes, units = ([*row, *[""] * width][:width] for row in rows)
     if format.sensor_begins:
         begins = [column for column, name in enumerate(own) if name and _match(format.sensor_begins, name)]
     else:
         begins = [column for column, owner in enumerate(owners) if owner]
-    titles, sensors, name = list[str](), [""] * width, ""
+    titles, sensors = list[str](), [""] * width
     for count, (first, last) in enumerate(zip(begins, [*begins, width][1:], strict=True), 1):
-        title = re.sub(r" *\(\d+\)$", "", ([cell for cell in owners[first:last] if cell] or [f"sensor {count}"])[-1])
+        title = next(filter(None, reversed(owners[first:last])), f"sensor {count}")
+        title = re.sub(r" *\(\d+\)$", "", title)
         titles.append(f"{title} {count}" if title in titles else title)
         sensors[first:last] = titles[-1:] * (last - first)
-    names = []
-    for column in range(width):
-        name = own[column] or (name if format.axes_line and axes[column] else "")
-        names.append("/".join(filter(None, (sensors[column], name, axes[column]))))
-    return names, units
+    if format.axes_line:  # a name is that of the axes after it too
+        for column in range(1, width):
+            own[column] = own[column] or (own[column - 1] if axes[column] else "")
+    return ["/".join(filter(None, parts)) for parts in zip(sensors, own, axes, strict=True)], units
 
 
 def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[DeviceTable]:
     """Parse the file, or those of a folder or zip that hold what is needed."""
     kinds = [use] if use else list(NEEDED)
-    alone = path.is_file() and path.suffix.lower() != ".zip"
-    table = parse_table(format, path) if alone else None
+    table = parse_table(format, path) if path.is_file() and path.suffix.lower() != ".zip" else None
     if table and (not format.files or any(_has(_find_sensors(format, [table]), kind) for kind in kinds)):
         return [table]
     if format.files:
@@ -350,9 +334,9 @@ def _find_sensors(format: TableFormat, tables: Sequence[DeviceTable]) -> _Sensor
 def _name_alone(format: TableFormat, path: Path) -> str:
     """Name the only sensor of a file or folder."""
     path = path.absolute()
-    if path.is_dir() or any(fnmatch.fnmatch(path.name, pattern) for pattern in format.files.values()):
-        return path.name if path.is_dir() else path.parent.name
-    return path.stem
+    if any(fnmatch.fnmatch(path.name, pattern) for pattern in format.files.values()) and not path.is_dir():
+        path = path.parent
+    return path.name if path.is_dir() else path.stem
 
 
 def _read_values(signal: str, source: _Source) -> np.ndarray:
@@ -382,6 +366,10 @@ def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float
         column = _find_time(format, clock, source, sensor)
         if column is None or not table.has_values([column]):
             continue
+        if not clock.rate and not rate_hz:
+            if column not in table.times:
+                table.times[column] = _read_clock(table, clock, column)
+            return table.times[column]
         if clock.rate:
             stated = next((value for name, value in table.about.items() if _match(clock.rate, name)), "")
             number = _STATED_RATE.match(stated)
@@ -390,17 +378,6 @@ def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float
             if rate > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
                 packets = _unwrap(counter, clock.wraps)
                 return table.times.setdefault(column, packets / (max(1.0, float(np.median(np.diff(packets)))) * rate))
-        elif not rate_hz:
-            if column not in table.times:
-                cells = table.cells[str(column)]
-                if clock.date and cells.dtype == pl.String:
-                    cells = cells.str.to_datetime(clock.date, time_unit="us", strict=False)
-                if cells.dtype.is_temporal() and cells.count():
-                    time = 1e-6 * cells.cast(pl.Int64).cast(pl.Float64).fill_null(np.nan).to_numpy()
-                else:
-                    time = clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
-                table.times[column] = spread_equal_times(time) if clock.spread else time
-            return table.times[column]
     if rate_hz:
         return table.times.setdefault(None, np.arange(table.cells.height) / rate_hz)
     names = " or ".join(f"'{clock.column}'" for clock in format.clocks)
@@ -417,6 +394,16 @@ def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor:
     matches = {k: match for k, name in enumerate(table.names) if (match := _match(clock.column, name))}
     own = (k for k, match in matches.items() if match.groupdict().get("sensor") == sensor)
     return next(own, next(iter(matches), None))  # else the times may be shared
+
+
+def _read_clock(table: DeviceTable, clock: ClockColumn, column: int) -> np.ndarray:
+    """Read a column of times (n,) [s], numbers or dates."""
+    cells = table.cells[str(column)]
+    if clock.date and cells.dtype == pl.String:
+        dates = cells.str.to_datetime(clock.date, time_unit="us", strict=False)
+        if dates.count():
+            return 1e-6 * dates.cast(pl.Int64).cast(pl.Float64).fill_null(np.nan).to_numpy()
+    return clock.unit_s * _unwrap(table.numbers([column])[:, 0], clock.wraps)
 
 
 def _unwrap(counter: np.ndarray, wraps: float | None) -> np.ndarray:

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from ..angles import NEAR_LOCK, diagnose_lock, euler, joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption
-from ..readers.opensim import OWN
+from ..readers.registry import OWN_STO
 from ..rotations import conjugate, multiply, rotation_about
 from ..tracking import TrackResult
 from .motion import check_complete, diagnose_gaps, find_measured_points, resample_evenly
@@ -114,7 +114,7 @@ def _write_quaternions(path: Path, motion: TrackResult, time: np.ndarray, quat_G
         f"{body}_imu": [f"{w:.9f},{x:.9f},{y:.9f},{z:.9f}" for x, y, z, w in quat.tolist()]
         for body, quat in quat_GB.items()
     }
-    header = [f"DataRate={motion.rate_hz:f}", "DataType=Quaternion", "version=3", "=".join(OWN), "endheader"]
+    header = [f"DataRate={motion.rate_hz:f}", "DataType=Quaternion", "version=3", "=".join(OWN_STO), "endheader"]
     _write_rows(path, header, pl.DataFrame({"time": time, **cells}))
 
 
