@@ -85,6 +85,34 @@ def test_a_sensor_that_freezes_is_lost_from_there(signals: str, since: float, ma
     assert all(sensor.gap is None for name, sensor in read.sensors.items() if name != BROKEN)
 
 
+@pytest.mark.parametrize(("signal", "axes"), [("gyro", "y"), ("accel", "y"), ("gyro", "")])
+def test_a_dead_axis_is_refused_by_name_of_files_and_of_arrays(
+    signal: str, axes: str, made: Simulation, tmp_path: Path
+) -> None:
+    recording, pairs = made.recording("dead"), {}
+    for name, sensor in recording.sensors.items():
+        values = {"gyro": sensor.gyro_S.copy(), "accel": sensor.accel_S.copy()}
+        if name == BROKEN:
+            values[signal][:, 1 if axes else slice(None)] = 0.0
+        pairs[name] = tuple(values.values())
+    text = f"{signal} {axes}".strip() + " stands still at 0"
+    files = with_sensor(recording, BROKEN, gyro_S=pairs[BROKEN][0], accel_S=pairs[BROKEN][1])
+    with pytest.raises(WeposeError, match=f"sensors.{BROKEN}: {text}"):
+        load_session(written(tmp_path / "in", files))
+    with pytest.raises(WeposeError, match=f"sensors.{BROKEN}: {text}"):
+        Recording.from_arrays(RATE, **pairs)
+    with pytest.raises(WeposeError, match=f"^{text}"):
+        estimate_orientation(*pairs[BROKEN], RATE, static=(0.5, 4.5))
+
+
+def test_a_planar_motion_without_noise_is_measured() -> None:
+    """One axis never changes; the other two move."""
+    swing = np.sin(2.0 * np.arange(1000) / RATE).clip(0.0)[:, None]
+    gyro, accel = swing * [0.5, 0.0, 0.3], swing * [2.0, 1.0, 0.0] + [0.0, 0.0, 9.81]
+    assert len(Recording.from_arrays(RATE, torso=(gyro, accel))) == 1000
+    estimate_orientation(gyro, accel, RATE, static=(1.6, 3.1))
+
+
 def test_a_dead_accelerometer_of_arrays_is_refused_by_name(made: Simulation) -> None:
     recording = made.recording()
     dead = with_sensor(recording, BROKEN, accel_S=np.zeros((len(recording), 3)))

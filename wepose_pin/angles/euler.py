@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..recording.gaps import find_runs
+from ..recording import find_runs
 
 # The standard deviation [rad] of an unknown angle: uniform over the circle.
 UNKNOWN = np.pi / np.sqrt(3.0)

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..body.kinematics import Pose, find_samples
 from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
-from ..recording import Intervals
-from ..recording.gaps import find_runs
+from ..recording import Intervals, find_runs
 from ..rotations import unwrap_signs
 from .euler import count_turns
 from .joints import AUTO, JOINTS, Angles, JointAngles, compute_gradients, joint_angles

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..compilation import inlined, kernel
 from ..documents import Key
-from ..recording.sensors import AXES
+from ..recording import AXES
 from ..rotations import product
 
 MAX_ELEVATION = np.deg2rad(130.0)  # [rad] up to which the law holds; it stays there beyond

@@ -18,7 +18,7 @@ import numpy as np
 from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml
 from ..errors import BadModel, one_of
 from ..libraries import asset
-from ..recording.sensors import AXES, read_axes
+from ..recording import AXES, read_axes
 from .girdle import Direction, Girdle, SegmentName
 
 DEFAULT_BODY = "upper_body"

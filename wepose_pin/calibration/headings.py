@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 
 from ..body.tree import UNIVERSE
 from ..filters.butterworth import band_pass
-from ..filters.sensors import FilteredRecording
 from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, find_neighbours, linearize_joint
 from ..recording import Recording
 from .equations import Gaussian, Layout
@@ -209,7 +208,7 @@ def _turn_by_hinges(fit: LeastSquares, headings: np.ndarray) -> float:
 
 
 def estimate_couplings(
-    recording: Recording, filtered: FilteredRecording, layout: Layout, samples: np.ndarray
+    recording: Recording, R_VS: Mapping[str, Rotation], start: tuple[float, float], layout: Layout, samples: np.ndarray
 ) -> Couplings | None:
     """Return those of each joint between two IMUs, from the motion in these samples (n,); None: it is too short."""
     neighbours = find_neighbours(layout.model, layout.sensors)
@@ -218,8 +217,8 @@ def estimate_couplings(
         return None
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]
     names = dict.fromkeys(name for pair in pairs for name in pair)
-    sides = {name: compute_joint_sides(recording, filtered, name)[samples] for name in names}
-    elapsed_s = float(np.mean(recording.time[samples]) - filtered.start[1])
+    sides = {name: compute_joint_sides(recording, R_VS[name], name)[samples] for name in names}
+    elapsed_s = float(np.mean(recording.time[samples]) - start[1])
     H, heading, std = np.zeros((len(pairs), layout.size)), np.empty(len(pairs)), np.empty(len(pairs))
     for row, pair in enumerate(pairs):
         heading[row], std[row] = estimate_heading(*(sides[name] for name in pair))
@@ -238,14 +237,13 @@ def add_couplings(prior: Gaussian, couplings: Couplings) -> Gaussian:
     return mean + np.linalg.solve(information, weighted @ wrap_angle(heading - H @ mean)), information
 
 
-def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name: str) -> np.ndarray:
+def compute_joint_sides(recording: Recording, R_VS: Rotation, name: str) -> np.ndarray:
     """(n, 3, 4) in V, band-passed: specific force, and what a lever of 1 m along each axis adds to the joint's."""
     accel_S, at = recording.imus[name].accel_S, np.arange(len(recording))
     finite = np.isfinite(accel_S).all(axis=1)
     if not finite.all():
         accel_S = np.column_stack([np.interp(at, at[finite], axis[finite]) for axis in accel_S.T])
-    R_VS = filtered.R_VS[name].as_matrix()
-    sides = compute_sides(R_VS[:, None], accel_S[:, None], recording.rate_hz)[:, 0, :, :4]
+    sides = compute_sides(R_VS.as_matrix()[:, None], accel_S[:, None], recording.rate_hz)[:, 0, :, :4]
     return band_pass(np.concatenate([sides[:1], sides, sides[-1:]]), BAND_HZ, recording.rate_hz)
 
 

@@ -52,12 +52,12 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         The gap does not determine the lengths.
     """
     _check_problem(problem)
-    recording, filtered, prior = problem.recording, problem.filtered, problem.prior
-    mounts, headings, mount_diagnostics = align_sensors(recording, prior, filtered.R_VS_start, filtered.start)
+    recording, prior = problem.recording, problem.prior
+    mounts, headings, mount_diagnostics = align_sensors(recording, prior, problem.R_VS_start, problem.start)
     data, condition_index, samples = problem.observe()
     quat_WL = {
         name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
-        for name, R_VS in filtered.R_VS.items()
+        for name, R_VS in problem.R_VS.items()
     }
     names = problem.layout.lengths
     A = np.zeros((len(samples), 3, len(names)))
@@ -100,7 +100,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         subject=replace(subject, girdles=dict.fromkeys(problem.model.table.girdles, FIXED)),
         effective_sample_size=len(gaps) / correlated,
         scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
-        remarks=(*filtered.diagnostics, *mount_diagnostics),
+        remarks=(*recording.diagnostics, *mount_diagnostics),
         time=recording.time[samples],
         gap=np.linalg.norm(gaps, axis=1),
         prior_gap=np.linalg.norm(prior_gaps, axis=1),

@@ -24,9 +24,8 @@ from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
-from ..filters.sensors import FilteredRecording
-from ..recording import Recording, format_span
-from ..recording.gaps import find_runs
+from ..filters.phases import average_start
+from ..recording import Recording, find_runs, format_span
 from .equations import Gaussian, Layout
 from .headings import Couplings, estimate_couplings
 from .protocols import Closure, Condition, FreeMotion, Protocol
@@ -59,8 +58,9 @@ def find_layout(protocol: Protocol, model: BodyModel, recording: Recording) -> L
 class CalibrationProblem:
     """The inputs of a calibration, and what follows from them before anything is estimated."""
 
-    recording: Recording  # the samples
-    filtered: FilteredRecording  # the orientations of its sensors, each in its own world
+    recording: Recording  # the samples, with diagnostics of the start pose
+    R_VS: Mapping[str, Rotation]  # segment → n orientations of its sensor, in its own world
+    start: tuple[float, float]  # [s] of the start pose
     layout: Layout  # the unknowns of what the person did in which phase
     prior: Subject  # lengths with their covariance, and mounts
     measured: Mapping[str, tuple[float, float]]  # name of a length → value and standard deviation [m]
@@ -94,6 +94,11 @@ class CalibrationProblem:
 
     # Mounts and labels ------------------------------------------------------------------------------------------------
 
+    @cached_property
+    def R_VS_start(self) -> dict[str, Rotation]:
+        """Segment → mean orientation of its sensor in the start pose."""
+        return average_start(self.recording, self.R_VS, self.start)
+
     def mount(self, segment: str) -> Rotation | None:
         """Return the mount of prior or session, with an L that equals W in the start pose; None: unknown."""
         start_pose = self.layout.start_pose
@@ -103,7 +108,7 @@ class CalibrationProblem:
     @cached_property
     def stated_headings(self) -> dict[str, float]:
         """Segment → ψ [rad] by its mount, of those whose mount is known."""
-        starts = [(name, R_VS, self.mount(name)) for name, R_VS in self.filtered.R_VS_start.items()]
+        starts = [(name, R_VS, self.mount(name)) for name, R_VS in self.R_VS_start.items()]
         return {name: compute_heading_offset(R_VS, mount) for name, R_VS, mount in starts if mount is not None}
 
     def sensor_prior(self, segment: str) -> Gaussian:
@@ -129,7 +134,7 @@ class CalibrationProblem:
             of_mount = np.diag([0.0, 0.0, STATED_STD**-2])
         else:
             of_mount = np.eye(3) / MEASURED_ORIENTATION_STD**2
-        misfit = (Rotation.from_rotvec(heading) * self.filtered.R_VS_start[segment] * mount.inv()).as_rotvec()
+        misfit = (Rotation.from_rotvec(heading) * self.R_VS_start[segment] * mount.inv()).as_rotvec()
         signs = np.diag([-1.0, -1.0, 1.0])
         both = information + signs @ of_mount @ signs
         target = information @ mean - signs @ of_mount @ np.append(misfit[:2], 0.0)
@@ -151,7 +156,7 @@ class CalibrationProblem:
             if mount is None or (estimated is not None and name not in estimated):
                 continue
             if estimated is None:
-                up_V = (self.filtered.R_VS_start[name] * mount.inv()).apply([0.0, 0.0, 1.0])
+                up_V = (self.R_VS_start[name] * mount.inv()).apply([0.0, 0.0, 1.0])
                 angle = float(np.arccos(np.clip(up_V[2], -1.0, 1.0)))
             else:
                 R_estimated = self.layout.start_pose.to_world(name, Rotation.from_quat(estimated[name]))
@@ -168,19 +173,15 @@ class CalibrationProblem:
             return {segment: values[exchanged.get(segment, segment)] for segment in values}
 
         recording = replace(self.recording, sensors=exchange(self.recording.sensors))
-        R_VS, R_VS_start = exchange(self.filtered.R_VS), exchange(self.filtered.R_VS_start)
-        filtered = self.filtered._replace(R_VS=R_VS, R_VS_start=R_VS_start)
-        return replace(self, recording=recording, filtered=filtered, exchanged=exchanged)
+        return replace(self, recording=recording, R_VS=exchange(self.R_VS), exchanged=exchanged)
 
     def orient_segments(self, mounts: Mapping[str, np.ndarray], samples: np.ndarray) -> dict[str, np.ndarray]:
         """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""
-        filtered, quat_WL = self.filtered, {}
-        for name in (name for name in filtered.R_VS if name in mounts):
+        quat_WL = {}
+        for name in (name for name in self.R_VS if name in mounts):
             R_LS = Rotation.from_quat(mounts[name])
-            psi = compute_heading_offset(filtered.R_VS_start[name], self.layout.start_pose.to_world(name, R_LS))
-            quat_WL[name] = (
-                Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS[name][samples] * R_LS.inv()
-            ).as_quat()
+            psi = compute_heading_offset(self.R_VS_start[name], self.layout.start_pose.to_world(name, R_LS))
+            quat_WL[name] = (Rotation.from_rotvec([0.0, 0.0, psi]) * self.R_VS[name][samples] * R_LS.inv()).as_quat()
         return quat_WL
 
     # Samples ----------------------------------------------------------------------------------------------------------
@@ -189,7 +190,7 @@ class CalibrationProblem:
     @cached_property
     def phase_samples(self) -> list[np.ndarray]:
         """The numbers of the samples of each condition's phase; `BadPhase` where the recording lacks a phase."""
-        recording, begin, samples = self.recording, self.filtered.start[1], list[np.ndarray]()
+        recording, begin, samples = self.recording, self.start[1], list[np.ndarray]()
         for condition in self.layout.conditions:
             free = ((begin, min(begin + FREE_S, float(recording.time[-1]))),)
             inside = np.zeros(len(recording), dtype=bool)  # each sample counts once where intervals overlap
@@ -206,7 +207,7 @@ class CalibrationProblem:
         nothing was lost.
         """
         recording, n = self.recording, len(self.recording)
-        begin, longest = recording.span(self.filtered.start).start, LONGEST_LOSS_S * recording.rate_hz
+        begin, longest = recording.span(self.start).start, LONGEST_LOSS_S * recording.rate_hz
         gaps = {name: recording.imus[name].gap for name in self.layout.sensors if name in recording.imus}
         runs = [(a, b, name) for name, gap in gaps.items() if gap is not None for a, b in find_runs(gap)]
         losses = [(a, b, name) for a, b, name in runs if b - a > longest]
@@ -229,7 +230,7 @@ class CalibrationProblem:
         phases = zip(self.layout.conditions, self.phase_samples, strict=True)
         moving = [phase for condition, phase in phases if isinstance(condition, Closure | FreeMotion)]
         samples = np.unique(np.concatenate([np.zeros(0, dtype=int), *moving]))
-        return estimate_couplings(self.recording, self.filtered, self.layout, samples[self.usable[samples]])
+        return estimate_couplings(self.recording, self.R_VS, self.start, self.layout, samples[self.usable[samples]])
 
     def diagnose_losses(self) -> list[Diagnostic]:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
@@ -246,7 +247,7 @@ class CalibrationProblem:
 
         It raises `BadPhase` where a condition has too few samples with all sensors, connected with the start pose.
         """
-        recording, filtered, layout = self.recording, self.filtered, self.layout
+        recording, layout = self.recording, self.layout
         (connected, lost, loss), parts, places = self.connected, list[np.ndarray](), list[np.ndarray]()
         stride = max(1, round(recording.rate_hz / rate_hz), sum(map(len, self.phase_samples)) // MOST_SAMPLES)
         for condition, phase in zip(layout.conditions, self.phase_samples, strict=True):
@@ -271,10 +272,10 @@ class CalibrationProblem:
                 raise BadPhase(f"{recording.where()}: {text}")
         samples = np.concatenate(parts)
         rotations_since_start = [
-            (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
+            (self.R_VS[name][samples] * self.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
         recorded = np.concatenate(places).T[: layout.place.stop - layout.place.start]
-        data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
+        data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - self.start[1]])
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         return data, condition_index, samples
 

@@ -38,8 +38,8 @@ from ..body.subject import Hinge, Subject, girdle_rows, mount_rows, population_s
 from ..body.table import check_segments
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
-from ..filters import BEST, check_method
-from ..filters.sensors import start_filters
+from ..filters import BEST, SensorFilters, check_method
+from ..filters.phases import collect_orientations, find_reference_phases
 from ..recording import Recording
 from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
 from .headings import add_couplings, search_headings
@@ -151,11 +151,13 @@ def calibrate(
     prior = prior or population_subject(stature, sex, model)
     prior.check_body(model.table)
     lengths = convert_breadths(measured or {}, model.table, measured_std)
-    _, filtered = start_filters(recording, method=method, sways=not model.table.is_mechanism)
+    start, _, noises, diagnostics = find_reference_phases(recording, not model.table.is_mechanism)
+    filtered = SensorFilters(noises, method=method, start=recording.span(start)).push(recording)
+    recording, R_VS = replace(recording, diagnostics=tuple(diagnostics)), collect_orientations(recording, filtered)
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:  # the two calibrations are fused, each on the population prior
         prior = separate_mounts(earlier, population_subject(body=model))
-    problem = CalibrationProblem(recording, filtered, find_layout(protocol, model, recording), prior, lengths)
+    problem = CalibrationProblem(recording, R_VS, start, find_layout(protocol, model, recording), prior, lengths)
     calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
     if earlier is not None:
         fused = fuse_calibrations(earlier, calibration.subject, model.table)
@@ -215,7 +217,7 @@ def list_mount_alternatives(stated: Calibration) -> list[Alternative]:
     """Return the problem without mounts that the motion contradicts, where the quick solution gives a reason."""
 
     def leave_out_contradicted(problem: CalibrationProblem) -> CalibrationProblem:
-        free = solve_problem(problem.remove_mounts(problem.filtered.R_VS), quick=True)
+        free = solve_problem(problem.remove_mounts(problem.R_VS), quick=True)
         return problem.leave_out_mounts(free.subject.mounts)
 
     contradicted = stated.problem.leave_out_mounts(stated.subject.mounts).unused_mounts != stated.problem.unused_mounts
@@ -267,7 +269,7 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
 
 def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquares, x_cov: np.ndarray) -> Calibration:
     """Return the calibration that a solution at samples (n,) makes, with the covariance (m, m) of x."""
-    layout, prior, filtered = problem.layout, problem.prior, problem.filtered
+    layout, prior = problem.layout, problem.prior
     closed = np.zeros(len(samples), dtype=bool)
     for _, span in fit.closures:
         closed[span] = True
@@ -288,11 +290,11 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
         np.where(closed, np.linalg.norm(gaps, axis=1), np.nan)
         for gaps in (fit.measure_gaps(fit.x), fit.measure_gaps(fit.place_points(prior_x)))
     )
-    diagnostics = [*filtered.diagnostics, *problem.diagnose_losses()]
+    diagnostics = [*problem.recording.diagnostics, *problem.diagnose_losses()]
     if not problem.protocol.closures:
         facts = {"protocol": problem.protocol.title, "prior": prior.note or prior.name}
         diagnostics.append(Diagnostic("lengths-not-observed", INFO, facts=facts))
-    for name in [name for name in filtered.R_VS if name not in subject.mounts]:
+    for name in [name for name in problem.R_VS if name not in subject.mounts]:
         diagnostics.append(Diagnostic("mount-unknown", WARNING, name, facts={"protocol": problem.protocol.name}))
     for phase, deviation in fit.posed.items():
         if deviation > CONTRADICTED and fit.closures:
@@ -316,7 +318,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
 
 def _make_subject(problem: CalibrationProblem, fit: LeastSquares, x_cov: np.ndarray, scatter: float) -> Subject:
     """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`estimate_scatter`)."""
-    R_VS_start, layout, x = problem.filtered.R_VS_start, fit.layout, fit.x
+    R_VS_start, layout, x = problem.R_VS_start, fit.layout, fit.x
     std, R_WS_start, offsets, drifts = np.sqrt(np.diag(x_cov)), {}, {}, {}
     for name, heading, tilt, drift in zip(layout.sensors, layout.heading, layout.tilt, layout.drift, strict=True):
         R_WV = Rotation.from_rotvec([0.0, 0.0, x[heading]])

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..body.subject import Quality, Subject
 from ..body.table import ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences, notebook_html, render
-from ..recording import format_span
-from ..recording.gaps import find_runs
+from ..recording import find_runs, format_span
 from .least_squares import CONTRADICTED, MIN_CONTACT, MeasuredLength
 from .problem import CalibrationProblem
 

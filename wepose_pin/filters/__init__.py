@@ -14,7 +14,7 @@ from ..arguments import check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
-from ..recording.faults import find_faults, find_gyro_range, find_largest, has_repeats
+from ..recording.faults import check_arrays, find_gyro_range, find_largest
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 from .amekf import AmekfParams
 from .base import Orientation, join_orientations
@@ -131,11 +131,7 @@ def estimate_orientation(
             raise BadData(
                 f"{name} has a value of {largest:.6g}: no sensor measures above {most:g} {unit}; check the unit"
             )
-    if has_repeats(gyro) or has_repeats(accel):
-        for fault in find_faults({"": (np.arange(len(gyro)) / rate_hz, gyro, accel)}).get("", []):
-            raise BadData(
-                f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out"
-            )
+    check_arrays("", rate_hz, {"": (gyro, accel)})
     noise: SensorNoise = TYPICAL
     start = None
     diagnostics: tuple[Diagnostic, ...] = ()

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, WeposeError
-from ..recording import ImuSensor, OrientationSensor, Recording, format_span, format_time
-from ..recording.gaps import find_runs
-from ..recording.sensors import compute_rate
+from ..recording import ImuSensor, OrientationSensor, Recording, compute_rate, find_runs, format_span, format_time
+from .base import Orientation
 from .noise import SensorNoise, estimate_noise
 
 # Motion in the start pose: root mean square of the rate, and largest rotation from the mean. A standing person sways
@@ -231,3 +232,18 @@ def find_static_window(recording: Recording) -> tuple[float, float]:
         )
     first = int(np.argmin(motion)) * stride
     return float(time[first]), float(time[first + window - 1])
+
+
+def collect_orientations(recording: Recording, filtered: Mapping[str, Orientation]) -> dict[str, Rotation]:
+    """Return segment → n orientations R_VS of its sensor, `filtered` or measured; without mounts."""
+    return {
+        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else filtered[segment]).quat_VS)
+        for segment, sensor in recording.sensors.items()
+    }
+
+
+def average_start(
+    recording: Recording, R_VS: Mapping[str, Rotation], start: tuple[float, float]
+) -> dict[str, Rotation]:
+    """Return segment → mean orientation of its sensor in the start pose [s]."""
+    return {name: each[recording.find_measured(name, start)].mean() for name, each in R_VS.items()}

@@ -1,4 +1,4 @@
-"""The filters of sensors, whole or sample by sample: `SensorFilters`, which `start_filters` starts on a recording."""
+"""The filters of sensors, whole or sample by sample: `SensorFilters`."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, one_of
-from ..recording import ImuSensor, OrientationSensor, Recording
+from ..recording import ImuSensor, Recording
 from .amekf import AMEKF, AmekfParams
 from .base import Orientation, OrientationFilter, as_rows, count_processors, make_orientation
 from .complementary import GDC, NCF
 from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
-from .phases import find_reference_phases
 from .smekf import PUBLISHED_SMEKF, SMEKF, SmekfParams
 from .smoother import SMOOTHER
 from .static import USUAL_TEST, StaticTest, find_static, make_static_records
@@ -200,32 +197,3 @@ class SensorFilters:
                 quat_VS, tilt_std = rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD
         self._records[name] = static_records, make(self._method, noise, quat_VS)
         return first
-
-
-class FilteredRecording(NamedTuple):
-    """Orientations of every sensor in its own world, without mounts."""
-
-    R_VS: dict[str, Rotation]  # segment → n orientations of its sensor
-    R_VS_start: dict[str, Rotation]  # their mean in the start pose
-    orientation: dict[str, Orientation]  # the filter's result; none for measured orientations
-    start: tuple[float, float]  # [s] of the start pose
-    static_phase: tuple[float, float]  # [s] of noise and bias
-    diagnostics: list[Diagnostic]  # of the recording, and of its start pose
-
-
-def start_filters(
-    first: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
-) -> tuple[SensorFilters, FilteredRecording]:
-    """Filter a recording, or the first chunk of one, with the start pose; the filters take the next chunks.
-
-    `sways`: a person stands in the start pose; a mechanism stands still. `WeposeError`: a start phase with too few
-    samples, or with motion; an unknown method.
-    """
-    start, static, noises, diagnostics = find_reference_phases(first, sways)
-    filters = SensorFilters(noises, method=method, static_test=static_test, start=first.span(start))
-    orientation, R_VS, R_VS_start = filters.push(first), {}, {}
-    for segment, sensor in first.sensors.items():
-        quat_VS = (sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_VS
-        R_VS[segment] = Rotation.from_quat(quat_VS)
-        R_VS_start[segment] = R_VS[segment][first.find_measured(segment, start)].mean()
-    return filters, FilteredRecording(R_VS, R_VS_start, orientation, start, static, diagnostics)

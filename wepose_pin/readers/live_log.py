@@ -25,8 +25,7 @@ from ..errors import BadData
 from ..libraries import check_file, library_errors
 from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor, check_recording
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
-from ..recording.clocks import Clock
-from ..recording.gaps import GOOD, LONG, bridge, bridge_quat
+from ..recording.clocks import GOOD, LONG, Clock, bridge, bridge_quat
 from .device import Device, DeviceSensor
 
 MAGIC = b"\x89MCAP0\r\n"

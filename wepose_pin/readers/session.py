@@ -27,13 +27,27 @@ from ..recording import (
     check_phases,
     check_recording,
     compute_mount,
+    find_runs,
     format_span,
+    read_axes,
 )
-from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
+from ..recording.clocks import (
+    BRIDGED,
+    GOOD,
+    LONG,
+    LONGEST_GAP_S,
+    TIME_UNITS,
+    Clock,
+    bridge,
+    bridge_quat,
+    build_clock,
+    find_common_time,
+    mark_lost_samples,
+    measure_rate,
+    resample,
+)
 from ..recording.faults import Fault, check_sensors
-from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples, resample
 from ..recording.plausibility import check_signals
-from ..recording.sensors import read_axes
 from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device, check_measured
 from .registry import detect_format, find_format, read_device

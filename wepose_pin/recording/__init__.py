@@ -1,45 +1,384 @@
 """What the sensors measured: SI units, one even time base, sensors named by the segment that they are on.
 
-`recording` holds the type and its checks. What a file or a live source gives becomes one in these steps: `clocks` (the
-sensors' own times), `gaps` (lost samples, resampling), of a file; `arrivals` of a live source;
+`Recording` is checked once; the rooms after this one rely on the check. What a file or a live source gives becomes one
+in these steps: `clocks` (the sensors' own times, lost samples, resampling) of a file; `arrivals` of a live source;
 `faults` and `plausibility` say whether the sensors measured, by the `limits` of what sensors can.
 """
 
-from .recording import (
-    CONFIGURATION,
-    EACH_TIME,
-    Intervals,
-    Mark,
-    Recording,
-    check_phases,
-    check_recording,
-    check_selection,
-    check_time,
-    format_span,
-    format_time,
-    join_recordings,
-    select_interval,
-)
-from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
+from __future__ import annotations
 
-__all__ = [
-    "AXES",
-    "CONFIGURATION",
-    "EACH_TIME",
-    "ImuSensor",
-    "Intervals",
-    "Mark",
-    "OrientationSensor",
-    "Recording",
-    "Sensor",
-    "check_phases",
-    "check_recording",
-    "check_selection",
-    "check_time",
-    "compute_mount",
-    "find_mount_axes",
-    "format_span",
-    "format_time",
-    "join_recordings",
-    "select_interval",
-]
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .. import rotations
+from ..arguments import Positive, check_array, check_fields, check_numbers, check_value
+from ..diagnostics import Diagnostic, notebook_html
+from ..documents import TomlTable
+from ..errors import BadData, BadOption, BadPhase, one_of
+from .faults import check_arrays
+from .intervals import Intervals as Intervals
+from .intervals import check_phases as check_phases
+from .intervals import check_selection as check_selection
+from .intervals import check_time as check_time
+from .intervals import find_runs as find_runs
+from .intervals import format_span as format_span
+from .intervals import format_time as format_time
+from .intervals import select_interval as select_interval
+from .limits import MEDIAN_FORCE
+
+# Names of sensor axes in a stated mount.
+AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
+
+
+def compute_mount(up: str, forward: str) -> np.ndarray:
+    """Compute `quat_LS` (4,) xyzw from the sensor axes that point up and forward in the start pose, as ``"+x", "-z"``.
+
+    The rows of R_LS are the segment's axes in the sensor.
+    """
+    up_S, forward_S = AXES[up], AXES[forward]
+    return Rotation.from_matrix([forward_S, np.cross(up_S, forward_S), up_S]).as_quat()
+
+
+def read_axes(table: TomlTable, up: str | None = None, forward: str | None = None) -> tuple[str, str]:
+    """Read the two axis names from a table with the keys `up` and `forward`; missing keys take the defaults."""
+    up, forward = table.choice("up", AXES, up), table.choice("forward", AXES, forward)
+    if abs(AXES[up] @ AXES[forward]) > 0.5:
+        raise table.error(f"{table.at('forward')} = '{forward}' is parallel to up = '{up}'; name two different axes")
+    return up, forward
+
+
+def find_mount_axes(quat_LS: np.ndarray) -> tuple[str, str]:
+    """Find the axis names, up and forward, whose mount by `compute_mount` is nearest to this one."""
+    R_LS = Rotation.from_quat(quat_LS)
+    pairs = [(up, forward) for up in AXES for forward in AXES if AXES[up] @ AXES[forward] == 0.0]
+    return min(pairs, key=lambda pair: (R_LS * Rotation.from_quat(compute_mount(*pair)).inv()).magnitude())
+
+
+@dataclass(frozen=True)
+class ImuSensor:
+    """The measurements of a gyroscope and an accelerometer, n samples in the sensor's frame S.
+
+    Parameters
+    ----------
+    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
+    accel_S : (n, 3) [m/s²], specific force: a static sensor measures g, upward
+    stated_quat_LS : (4,) xyzw, the mount that the session states: sensor frame S to segment frame L; None: not stated
+    gap : (n,) bool, true where samples were lost for longer than 50 ms, or repeat one value, and were interpolated;
+        None: there are none
+    gyro_range : [rad/s] at which an axis of gyro saturates; infinite: not known
+    """
+
+    gyro_S: np.ndarray
+    accel_S: np.ndarray
+    stated_quat_LS: np.ndarray | None = None
+    gap: np.ndarray | None = None
+    gyro_range: float = np.inf
+    aligned = False  # measured orientations alone can be
+
+    def __repr__(self) -> str:
+        return f"ImuSensor({len(self.gyro_S)} samples)"
+
+    def part(self, samples: slice | np.ndarray) -> ImuSensor:
+        """Return the sensor at these samples."""
+        gap = None if self.gap is None else self.gap[samples]
+        return replace(self, gyro_S=self.gyro_S[samples], accel_S=self.accel_S[samples], gap=gap)
+
+
+@dataclass(frozen=True)
+class OrientationSensor:
+    """The orientations that a device measured, n samples; they are used as they are, without a filter of this package.
+
+    Parameters
+    ----------
+    quat_VS : (n, 4) xyzw, sensor frame S to a world V of the device's own: its z points up, its heading is arbitrary
+    stated_quat_LS, gap : as in `ImuSensor`
+    aligned : `quat_VS` is the orientation of the segment, not of the sensor, in a world that all aligned sensors
+        share; the start pose gives the heading of that world
+    """
+
+    quat_VS: np.ndarray
+    stated_quat_LS: np.ndarray | None = None
+    gap: np.ndarray | None = None
+    aligned: bool = False
+
+    def __repr__(self) -> str:
+        return f"OrientationSensor({len(self.quat_VS)} samples)"
+
+    def part(self, samples: slice | np.ndarray) -> OrientationSensor:
+        """Return the sensor at these samples."""
+        return replace(self, quat_VS=self.quat_VS[samples], gap=None if self.gap is None else self.gap[samples])
+
+
+Sensor = ImuSensor | OrientationSensor
+
+
+def join_sensors(parts: Sequence[Sensor]) -> Sensor:
+    """Join consecutive parts of one sensor; mount and range are those of the last part."""
+    signals = ("gyro_S", "accel_S") if isinstance(parts[-1], ImuSensor) else ("quat_VS",)
+    names = (*signals, "gap") if all(part.gap is not None for part in parts) else signals
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[-1], **{"gap": None} | joined)
+
+
+def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
+    """Compute the rate (n, 3) [rad/s] in S over the interval that ends at each sample.
+
+    Of measured orientations the first rate is a copy of the second.
+    """
+    if isinstance(sensor, ImuSensor):
+        return sensor.gyro_S
+    rate = rotations.compute_turns(sensor.quat_VS) * rate_hz
+    return np.concatenate([rate[:1], rate])
+
+
+# Recordings ----------------------------------------------------------------------------------------------------------
+
+# A start pose whose joints the session states.
+CONFIGURATION = "configuration"
+
+RATE_ERROR = 0.01  # allowed relative error of the stated rate; it is the relative error of all angles
+LONGEST_STEP = 2.5  # allowed step between two times, in steps of the rate; readers resample uneven clocks
+
+EACH_TIME = ", a row for each time"  # part of an error's text on an array's shape
+
+
+class Mark(NamedTuple):
+    """A text that was marked at a time."""
+
+    time: float  # [s]
+    text: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Sensors on one uniform time base.
+
+    Parameters
+    ----------
+    name : of the recording, for messages and titles
+    time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
+    rate_hz : samples a second
+    sensors : segment → `ImuSensor` or `OrientationSensor`, n samples each
+    phases : name → intervals [s] on `time`; in `start` the person holds the start pose, in `static` the sensors lie on
+        a table
+    start_pose : the pose in the phase `start`: "n_pose", another that the body's table names, or "configuration"
+    remounted : the sensors were remounted after the subject's calibration, so that its mounts do not hold here
+    start_is_guessed : `phases.start` was found in the motion and not stated by the user
+    source : the file of the recording, for messages
+    truth : a file with reference poses; None: there is none
+    resets : numbers of the samples before which a live session reset the headings, with the person in the start pose
+    marks : texts that were marked in a live session, with their times [s]
+    joints : joint → value [rad or m] in the start pose "configuration"; joints that are not named are at zero
+    model : the body that wears the sensors: the file of a table or a URDF, or the name of a body of the package;
+        empty: the upper body
+    diagnostics : assumptions, bridged gaps and faults from reading
+    """
+
+    name: str
+    time: np.ndarray
+    rate_hz: Positive
+    sensors: Mapping[str, Sensor]
+    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    start_pose: str = "n_pose"
+    remounted: bool = False
+    start_is_guessed: bool = False
+    source: Path | None = None
+    truth: Path | None = None
+    resets: tuple[int, ...] = ()
+    marks: tuple[Mark, ...] = ()
+    joints: Mapping[str, float] = field(default_factory=dict)
+    model: str = ""
+    diagnostics: tuple[Diagnostic, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __repr__(self) -> str:
+        phases = f", phases {', '.join(self.phases)}" if self.phases else ""
+        seconds = float(self.time[-1] - self.time[0])
+        about = f"{seconds:.1f} s at {self.rate_hz:g} Hz, {len(self.sensors)} sensors"
+        return f"Recording({self.name!r}: {about}{phases})"
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self, self.diagnostics)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        rate_hz: float,
+        *,
+        name: str = "recording",
+        phases: Mapping[str, Intervals] | None = None,
+        mounts: Mapping[str, tuple[str, str]] | None = None,
+        **sensors: tuple[np.ndarray, np.ndarray] | np.ndarray,
+    ) -> Recording:
+        """Make a recording of samples at an even rate, the first of them at 0 s, and check it.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Samples a second.
+        name : str
+            Of the recording.
+        phases : mapping, optional
+            Name → intervals [s]; without `start` the start pose is found in the motion.
+        mounts : mapping, optional
+            Segment → axes of its sensor that point up and forwards in the N-pose, such as ("+z", "+x"); not needed with
+            the subject of a calibration.
+        **sensors
+            Segment → (gyro_S, accel_S), (n, 3) [rad/s] and (n, 3) [m/s²], or quat_VS, (n, 4) xyzw. Fill or cut gaps
+            first.
+
+        Raises
+        ------
+        WeposeError
+            As `check`; a sensor that is neither, or that is dead or frozen.
+
+        Examples
+        --------
+        >>> torso = recording.sensors["torso"]
+        >>> mine = wp.Recording.from_arrays(100.0, torso=(torso.gyro_S, torso.accel_S), mounts={"torso": ("+z", "+x")})
+        >>> mine.sensors
+        {'torso': ImuSensor(2250 samples)}
+        """
+        check_value("rate_hz", rate_hz, Positive)
+        check_value("mounts", mounts or {}, Mapping[str, tuple[str, str]])
+        built: dict[str, Sensor] = {}
+        count = 0
+        for segment, values in sensors.items():
+            mount = None
+            if mounts and segment in mounts:
+                axes = dict(zip(("up", "forward"), mounts[segment], strict=False))
+                mount = compute_mount(*read_axes(TomlTable(axes, "mounts", f"{segment}.", BadOption)))
+            if isinstance(values, np.ndarray):
+                built[segment] = OrientationSensor(values, mount)
+            elif isinstance(values, tuple) and len(values) == 2:
+                built[segment] = ImuSensor(*values, mount)
+            else:
+                raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
+            count = count or len(np.atleast_1d(values[0] if isinstance(values, tuple) else values))
+        recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check()
+        check_arrays(f"{name}: sensors.", rate_hz, {each: (s.gyro_S, s.accel_S) for each, s in recording.imus.items()})
+        return recording
+
+    def check(self) -> Recording:
+        """Check a recording that was built in code, as `check_recording`, and its unit of force; return it."""
+        check_recording(self)
+        for segment, sensor in self.imus.items():
+            force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
+            if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
+                raise BadData(
+                    f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed, 9.8 "
+                    f"where nothing moves"
+                )
+        return self
+
+    @property
+    def imus(self) -> dict[str, ImuSensor]:
+        """Segment → sensor, of the sensors that have a gyroscope and an accelerometer."""
+        return {segment: sensor for segment, sensor in self.sensors.items() if isinstance(sensor, ImuSensor)}
+
+    def where(self) -> str:
+        """Return the beginning of an error's text: the file, or the recording's name."""
+        return str(self.source) if self.source else self.name
+
+    def span(self, interval: tuple[float, float]) -> slice:
+        """Return the slice of samples within the interval [s], both ends included."""
+        first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
+        return slice(int(first), int(last))
+
+    def find_measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
+        """Return the numbers (k,) of the samples within the interval [s] that the sensor measured: those in no gap."""
+        span, gap = self.span(interval), self.sensors[segment].gap
+        samples = np.arange(len(self))[span]
+        return samples if gap is None else samples[~gap[span]]
+
+    def cut(self, span: slice) -> Recording:
+        """Return the recording of a span of samples; `phases` and `marks` are not cut."""
+        first, last, _ = span.indices(len(self))
+        span = slice(first, last)
+        sensors = {name: sensor.part(span) for name, sensor in self.sensors.items()}
+        resets = tuple(tick - first for tick in self.resets if first <= tick < last)
+        return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
+
+    def chunks(self, seconds: float, first_s: float = 0.0) -> Iterator[Recording]:
+        """Iterate over consecutive chunks of `seconds`; the last one may be half a chunk longer or shorter.
+
+        The first one has `first_s` where that is more.
+        """
+        size = max(1, round(seconds * self.rate_hz))
+        first, last = 0, max(size, round(first_s * self.rate_hz))
+        while first < len(self):
+            last = len(self) if len(self) - last < 0.5 * size else last
+            yield self.cut(slice(first, last))
+            first, last = last, last + size
+
+    def phase(self, name: str) -> Intervals:
+        """Return the intervals of a phase; `BadPhase`: the recording does not have it."""
+        intervals = self.phases.get(name, ())
+        if not intervals:
+            live = bool(self.source) and str(self.source).endswith(".mcap")
+            add = f"write a session by `wepose info {Path(self.where()).name} --write` and add" if live else "add"
+            raise BadPhase(
+                f"{self.where()}: phases.{name} is needed here and missing; {add} [phases] {name} = "
+                f"[[from, to]] in seconds; {one_of(self.phases, name)}"
+                f"{'; without joined hands: --protocol free' if name == 'clasp' else ''}"
+            )
+        return intervals
+
+
+def join_recordings(first: Recording, second: Recording) -> Recording:
+    """Join two recordings of the same sensors in time; diagnostics are those of both, all else is the first's."""
+    sensors = {name: join_sensors([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
+    resets = (*first.resets, *(len(first) + tick for tick in second.resets))
+    diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
+    time = np.concatenate([first.time, second.time])
+    return replace(first, time=time, sensors=sensors, resets=resets, diagnostics=diagnostics)
+
+
+def check_recording(recording: Recording) -> Recording:
+    """Check a recording and return it.
+
+    `BadOption`: a field has a wrong type. `BadData`: shapes differ, samples are too few, a number is not finite, time
+    does not increase or contradicts the rate. `BadPhase`: a phase is empty or outside the recording.
+    """
+    where, time = recording.where(), recording.time
+    check_fields(recording, f"{where}: ")
+    if not recording.sensors:
+        raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
+    if len(time) < 2:
+        raise BadData(f"{where}: time has {len(time)} samples; a recording has at least 2")
+    check_array(f"{where}: time", time, (len(time),))
+    check_time(where, time)
+    steps, seconds = len(time) - 1, float(time[-1] - time[0])
+    if abs(seconds * recording.rate_hz - steps) > max(1.0, RATE_ERROR * steps):
+        raise BadData(
+            f"{where}: rate_hz = {recording.rate_hz:g}, and time has {steps / seconds:.6g} samples a second; they must "
+            f"agree to {100.0 * RATE_ERROR:g} %"
+        )
+    k = int(np.argmax(np.diff(time)))
+    if (time[k + 1] - time[k]) * recording.rate_hz > LONGEST_STEP:
+        raise BadData(
+            f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {recording.rate_hz:g} Hz; "
+            f"fill or cut the gap first"
+        )
+    if not all(0 <= tick < len(time) for tick in recording.resets):
+        raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
+    for segment, sensor in recording.sensors.items():
+        place, count = f"{where}: sensors.{segment}", len(time)
+        if isinstance(sensor, ImuSensor):
+            check_numbers(f"{place}.gyro", sensor.gyro_S, (count, 3), EACH_TIME)
+            check_numbers(f"{place}.accel", sensor.accel_S, (count, 3), EACH_TIME)
+        else:
+            check_numbers(f"{place}.orientation", sensor.quat_VS, (count, 4), EACH_TIME, unit=1e-6)
+        if sensor.stated_quat_LS is not None:
+            check_numbers(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
+        if sensor.gap is not None:
+            check_array(f"{place}.gap", sensor.gap, (count,), "b", EACH_TIME)
+    check_phases(where, time, recording.phases)
+    return recording

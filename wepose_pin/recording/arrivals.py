@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..compilation import kernel
+from . import ImuSensor, Sensor
 from .clocks import LONGEST_GAP_S
 from .faults import (
     AT_RANGE,
@@ -26,7 +27,6 @@ from .faults import (
     watch_saturation,
 )
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
-from .sensors import ImuSensor, Sensor
 
 # A sample within this share of a step from a tick counts as at the tick.
 SAME = 0.01

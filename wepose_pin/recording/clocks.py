@@ -1,16 +1,24 @@
-"""Clocks: the times of each sensor with lost rows filled in, and one even time base for all sensors."""
+"""Clocks: the times of each sensor with lost samples, which are bridged, and resampling to one even time base.
+
+A sample is lost when its row is missing (a long step in time) or its cells are empty. Gaps of up to `LONGEST_GAP_S` are
+bridged: rate and specific force linearly, measured orientations along the shortest rotation. A longer gap is an error,
+or is bridged and marked where the user allows it: filters take no sample in it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
+from .. import rotations
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData
+from . import OrientationSensor, Sensor
+from .intervals import check_time, find_runs, format_span
 from .limits import LONGEST_STEP_S, SHORTEST_STEP_S
-from .recording import check_time, format_span
 
 LONGEST_GAP_S = 0.05  # [s] of lost samples that are bridged silently
 # Relative deviation of a step from the usual one that means an uneven clock or a lost row; devices jitter less.
@@ -25,6 +33,7 @@ REGULAR = 0.2
 WITHIN_PACKET, SAME_SIZE, FEWEST_PACKETS = 0.5, 0.8, 5
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
+GOOD, BRIDGED, LONG = 0, 1, 2  # marks of samples
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
@@ -162,3 +171,67 @@ def _compute_drift(time: np.ndarray) -> float:
     mean = (time[-1] - time[0]) / (n - 1)
     sizes = [min(n - 1, max(1, round(seconds / mean))) for seconds in (1.0, 10.0)]
     return max(0.0, *(float(np.abs(time[s:] - time[:-s] - s * mean).max() - mean) / (s * mean) for s in sizes))
+
+
+# Lost samples, and resampling, which preserves total rotation ---------------------------------------------------------
+
+
+def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
+    """Mark every sample (n,) as `GOOD`, `BRIDGED` or `LONG`, by the length of the runs that are not `good` (n,)."""
+    marks = np.zeros(len(good), dtype=np.int8)
+    for first, last in find_runs(~good):
+        marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
+    return marks
+
+
+def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
+    """Fill lost samples of `values` (n, k) linearly in time; at the ends with the nearest value."""
+    lost = marks != GOOD
+    if not lost.any():
+        return values
+    filled = values.copy()
+    for k in range(values.shape[1]):
+        filled[lost, k] = np.interp(clock.time[lost], clock.time[~lost], values[~lost, k])
+    return filled
+
+
+def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
+    """Fill lost unit quaternions of `quat` (n, 4) along the shortest rotation; at the ends with the nearest one."""
+    filled = quat.copy()
+    for first, last in find_runs(marks != GOOD):
+        if first == 0 or last == len(quat):
+            filled[first:last] = quat[last] if first == 0 else quat[first - 1]
+            continue
+        edges = [first - 1, last]
+        turn = Slerp(clock.time[edges], Rotation.from_quat(quat[edges]))
+        filled[first:last] = turn(clock.time[first:last]).as_quat()
+    return filled
+
+
+def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
+    """Resample a sensor from its own times `clock` (n,) [s] to an even time base `time` (m,) within them.
+
+    The rate is integrated, interpolated as an orientation and differenced again, which preserves total rotation. The
+    specific force is interpolated linearly; on a coarser time base it is averaged over each step against aliasing.
+    """
+    gap = None
+    if sensor.gap is not None:
+        after = np.clip(np.searchsorted(clock, time - 1e-9), 0, len(clock) - 1)
+        gap = sensor.gap[after] | (sensor.gap[np.maximum(after - 1, 0)] & (clock[after] > time + 1e-9))
+    within = np.clip(time, clock[0], clock[-1])
+    if isinstance(sensor, OrientationSensor):
+        return replace(sensor, quat_VS=Slerp(clock, Rotation.from_quat(sensor.quat_VS))(within).as_quat(), gap=gap)
+    quat = rotations.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
+    R = Slerp(clock, Rotation.from_quat(quat))(within)
+    rate = rotations.compute_turns(R.as_quat()) / np.diff(time)[:, None]
+    dt = float(time[1] - time[0])
+    if dt < (1.0 + UNEVEN) * float(np.median(np.diff(clock))):
+        accel = np.column_stack([np.interp(within, clock, axis) for axis in sensor.accel_S.T])
+    else:
+        # A mean over each step is the difference of integrals at its ends.
+        trapezes = 0.5 * (sensor.accel_S[1:] + sensor.accel_S[:-1]) * np.diff(clock)[:, None]
+        integral = np.concatenate([np.zeros((1, 3)), np.cumsum(trapezes, axis=0)])
+        first, last = (np.clip(time + side * dt / 2.0, clock[0], clock[-1]) for side in (-1.0, 1.0))
+        accel = np.column_stack([np.interp(last, clock, axis) - np.interp(first, clock, axis) for axis in integral.T])
+        accel /= (last - first)[:, None]
+    return replace(sensor, gyro_S=np.concatenate([rate[:1], rate]), accel_S=accel, gap=gap)

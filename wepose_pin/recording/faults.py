@@ -1,7 +1,8 @@
 """Faults of sensors: dead, frozen or stuck at one value, saturated, or copies of one another.
 
 A repeated value alone is no fault: a coarse sensor on a table repeats for minutes, and so do data without noise. It is
-one where the signal is noisy and repeats much longer than otherwise, or all along while another signal is noisy.
+one where the signal is noisy and repeats much longer than otherwise, or all along while another signal is noisy. So is
+a single axis that never changes while the sensor moves and the other two are noisy.
 Files and live streams (`arrivals`) share what tells noise and saturation.
 """
 
@@ -16,9 +17,8 @@ import numpy as np
 from ..compilation import inlined, kernel
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from .gaps import find_runs
+from .intervals import find_runs, format_time
 from .limits import NARROWEST_GYRO_RANGE
-from .recording import format_time
 
 # Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5
@@ -49,7 +49,7 @@ SATURATION = np.dtype([(name, float, 3) for name in _OF_AXES], align=True)
 class Fault(NamedTuple):
     """An interval in which a sensor repeated one value and did not measure."""
 
-    signals: str  # `BOTH`, `GYRO` or `ACCEL`
+    signals: str  # `BOTH`, `GYRO` or `ACCEL`, with the name of the axis where it is one
     first: float  # [s] the last measured sample
     last: float  # [s] the last faulty sample
     value: tuple[float, ...]  # the repeated value, SI
@@ -57,7 +57,7 @@ class Fault(NamedTuple):
     def describe(self, since: float) -> str:
         """Describe the fault from the time [s] `since` on."""
         value = ", ".join(f"{v + 0.0:.4g}" for v in self.value)
-        unit = "m/s^2" if self.signals == ACCEL else "rad/s"
+        unit = "m/s^2" if self.signals.startswith(ACCEL) else "rad/s"
         stands = "stand still, gyro" if self.signals == BOTH else "stands still"
         return f"{self.signals} {stands} at {value} {unit} from {format_time(since)} to {format_time(self.last)} s"
 
@@ -105,6 +105,16 @@ def check_sensors(
     return faults, {name: find_gyro_range(*each[1:]) for name, each in imus.items()}, diagnostics
 
 
+def check_arrays(place: str, rate_hz: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Raise `BadData` where a sensor does not measure; `samples`: sensor → gyro and accel (n, 3), all numbers."""
+    if not any(may_have_faults(np.ascontiguousarray(values)) for arrays in samples.values() for values in arrays):
+        return
+    times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in samples.items()}
+    for name, faults in find_faults(times).items():
+        text = faults[0].describe(max(faults[0].first, 0.0))
+        raise BadData(f"{place}{name}{': ' * bool(name)}{text}: it does not measure there; leave these samples out")
+
+
 def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list[Fault]]:
     """Find sensor → the intervals in which it was frozen or stuck, in order of time; a sensor without is left out.
 
@@ -113,8 +123,14 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     faults: dict[str, list[Fault]] = {}
     for name, (time, *values) in samples.items():
         gyro_S, accel_S = map(np.ascontiguousarray, values)
-        if not (has_repeats(gyro_S) or has_repeats(accel_S)):
+        if not (may_have_faults(gyro_S) or may_have_faults(accel_S)):
             continue
+        moves = accel_S.std(axis=0).max() > MOVING
+        for signals, signal in ((GYRO, gyro_S), (ACCEL, accel_S)):
+            dead = np.flatnonzero((signal == signal[0]).all(axis=0))
+            if len(dead) == 1 and moves and _is_noisy(time, signal):
+                before, value = float(np.nextafter(time[0], -np.inf)), float(signal[0, dead[0]])
+                faults[name] = [Fault(f"{signals} {'xyz'[dead[0]]}", before, float(time[-1]), (value,))]
         covered = np.zeros(len(time), dtype=bool)
         of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
         for signals, columns, repeats, least_s in (
@@ -139,9 +155,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
                 if b - a == len(time) - 1:
                     is_stuck = any(_is_noisy(each[0], values) for each in samples.values() for values in each[1:])
                 if is_zero:  # a firmware with a dead zone reports zero at any rest
-                    is_moved = any(gyro.any() for _, gyro, _ in samples.values()) or accel_S.std(axis=0).max() > MOVING
                     others = np.count_nonzero(of_gyro & ~gyro_S.any(axis=1)) - (b - a)
-                    is_stuck &= is_moved and others < FROZEN_SAMPLES
+                    is_stuck &= others < FROZEN_SAMPLES and (moves or any(each[1].any() for each in samples.values()))
                 if is_stuck:
                     covered[a : b + 1] = True
                     # At the beginning of the recording the first sample is faulty, too.
@@ -161,8 +176,14 @@ def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def has_repeats(values):  # type: ignore[no-untyped-def]
-    """Return whether `FROZEN_SAMPLES` rows in a row have the same values, by one pair of so many."""
+def may_have_faults(values):  # type: ignore[no-untyped-def]
+    """Return whether an axis ends as it begins, or `FROZEN_SAMPLES` rows in a row have the same values: few signals do.
+
+    Of so many rows one pair is compared.
+    """
+    for k in range(3):
+        if len(values) > 1 and values[0, k] == values[-1, k] == values[len(values) // 2, k]:
+            return True
     for row in range(1, len(values), FROZEN_SAMPLES - 1):
         if is_same(values[row - 1], values[row]):
             first = last = row
@@ -228,7 +249,7 @@ def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
 def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
     """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
     state, values = start_saturation(), np.ascontiguousarray(values)
-    if _may_saturate(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * find_largest(values))):
+    if _may_saturate(values, least):
         _watch_all(state, values, least)
     return np.asarray(state["level"][0])
 
@@ -255,14 +276,18 @@ def find_largest(values):  # type: ignore[no-untyped-def]
 
 @kernel
 def _may_saturate(values, least):  # type: ignore[no-untyped-def]
-    """Return whether an axis has the same value, `least` or more, in `SHORT_PLATEAU` rows: most signals never do."""
-    for k in range(3):
-        stands = 1
-        for row in range(1, len(values)):
-            size, step = abs(values[row, k]), abs(values[row, k] - values[row - 1, k])
-            stands = stands + 1 if size >= least and step <= 2.0 * ROUNDING * size else 1
-            if stands == SHORT_PLATEAU:
-                return True
+    """Return whether an axis has the same value, `least` or more, in `SHORT_PLATEAU` rows: most signals never do.
+
+    Of three such rows two are an even row and the next one.
+    """
+    for row in range(1, len(values), 2):
+        for k in range(3):
+            value, tolerance = values[row, k], 2.0 * ROUNDING * abs(values[row, k])
+            if abs(value) >= least and abs(value - values[row - 1, k]) <= tolerance:
+                if abs(value - values[max(0, row - 2), k]) <= tolerance:
+                    return True
+                if abs(value - values[min(row + 1, len(values) - 1), k]) <= tolerance:
+                    return True
     return False
 
 

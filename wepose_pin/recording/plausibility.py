@@ -11,7 +11,9 @@ import numpy as np
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
 from ..rotations import unroll
+from . import ImuSensor, Recording
 from .faults import find_saturation
+from .intervals import format_span
 from .limits import (
     GRAVITY_ERROR_NOTED,
     GRAVITY_ERROR_REFUSED,
@@ -20,8 +22,6 @@ from .limits import (
     NARROWEST_ACCEL_RANGE,
     STANDARD_GRAVITY,
 )
-from .recording import Recording, format_span
-from .sensors import ImuSensor
 
 WINDOW_S, SHORTEST_WINDOW_S = 6.0, 3.0  # [s] over which specific force averages to gravity, half of a short recording
 FEWEST_WINDOWS, WINDOWS = 2, 20  # number of windows, those with most motion

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..documents import whole_folder
 from ..errors import UnknownKey, one_of
-from ..recording.gaps import find_runs
+from ..recording import find_runs
 from .words import plain
 
 WIDTH_IN = 9.2

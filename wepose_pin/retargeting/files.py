@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.urdf import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
-from ..recording import format_span
-from ..recording.gaps import find_runs
+from ..recording import find_runs, format_span
 from ..writers.motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
 from .checks import LimitCheck, SelfCollisions

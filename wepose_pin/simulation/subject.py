@@ -17,8 +17,7 @@ from ..body.kinematics import Pose
 from ..body.subject import BodyLength, Subject, population_subject
 from ..errors import BadOption
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
-from ..recording.clocks import Clock
-from ..recording.gaps import bridge, mark_lost_samples
+from ..recording.clocks import Clock, bridge, mark_lost_samples
 from ..rotations import compose, heading, log
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time

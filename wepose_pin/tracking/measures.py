@@ -16,11 +16,9 @@ from ..body import BodyModel, BodyTable
 from ..body.kinematics import Pose
 from ..body.links import compute_point_covariances
 from ..body.subject import Subject
-from ..recording import OrientationSensor, Recording
+from ..recording import OrientationSensor, Recording, compute_rate, find_runs
 from ..recording.faults import find_saturation
-from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
-from ..recording.sensors import compute_rate
 from .result import TrackResult
 from .segment_orientations import compute_heading_variance, compute_soft_tissue_covariance
 

@@ -14,8 +14,7 @@ from ..body.kinematics import Pose, join_poses
 from ..body.links import find_undetermined_joints
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, drop_consequences, gravest_first, merge
 from ..filters import STATIC_ONLY, Orientation, join_orientations
-from ..recording import Recording
-from ..recording.gaps import find_runs
+from ..recording import Recording, find_runs
 from .measures import (
     compute_error_budget,
     compute_heading_stds,

@@ -33,10 +33,9 @@ from ..body.table import check_segments
 from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..errors import BadOption, BadPhase, BadSession
-from ..filters import BEST, OFFLINE, Orientation, check_method
+from ..filters import BEST, OFFLINE, Orientation, SensorFilters, check_method
 from ..filters.base import HOLD_S, LOST_RATE_STD
-from ..filters.phases import BEGINNING_S
-from ..filters.sensors import start_filters
+from ..filters.phases import BEGINNING_S, average_start, collect_orientations, find_reference_phases
 from ..filters.static import StaticTest
 from ..recording import ImuSensor, Recording, Sensor, join_recordings
 from ..recording.arrivals import unpack_orientations
@@ -196,12 +195,14 @@ class Tracker:
         """Filter and align the first chunk."""
         collect_nominal_mounts(first, self._subject, self._start_pose)  # an error before anything is filtered
         sways = not self._body.table.is_mechanism
-        self._filters, filtered = start_filters(first, method=self._method, static_test=self._static_test, sways=sways)
-        self._start, self._static_phase = filtered.start, filtered.static_phase
-        mounts, offsets, diagnostics = align_sensors(
-            first, self._subject, filtered.R_VS_start, filtered.start, self._start_pose
+        self._start, self._static_phase, noises, diagnostics = find_reference_phases(first, sways)
+        self._filters = SensorFilters(
+            noises, method=self._method, static_test=self._static_test, start=first.span(self._start)
         )
-        self.diagnostics = tuple(drop_consequences((*filtered.diagnostics, *diagnostics)))
+        orientation = self._filters.push(first)
+        R_VS_start = average_start(first, collect_orientations(first, orientation), self._start)
+        mounts, offsets, of_mounts = align_sensors(first, self._subject, R_VS_start, self._start, self._start_pose)
+        self.diagnostics = tuple(drop_consequences((*diagnostics, *of_mounts)))
         self.names, self._rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         k = len(self.names)
         self._measured = np.array([name not in first.imus for name in self.names])
@@ -215,7 +216,7 @@ class Tracker:
         self.quat_WL = np.zeros((k, 4))
         # [rad²] `HeadingCorrector.variance` at the last step; NaN: the heading's variance is that of its filter
         self._variance = np.full((3, k), np.nan)
-        return filtered.orientation
+        return orientation
 
     def _observe_headings(
         self, first: Recording, orientation: Mapping[str, Orientation], states: tuple[np.ndarray, ...]
