@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.validation.simulated import compute_mount_errors
 from wepose_pin.angles import joint_angles
 from wepose_pin.angles.euler import wrap
-from wepose_pin.body.links import compute_axis_std
+from wepose_pin.body.kinematics import compute_axis_std
 from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.calibration import assess, calibrate
 from wepose_pin.errors import WeposeError

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import wepose_pin as wp
-from wepose_pin.errors import how_to_install
 from wepose_pin.filters import METHODS, OFFLINE, SensorFilters
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.recording import ImuSensor, Recording
@@ -26,7 +25,7 @@ from .tables import Column, Section, Table, is_installed, time_in_turn
 from .trials import read_broad, run_filter
 from .validation.single import simulate_paper_dynamic
 
-NO_PEERS = f"No ratios, they need VQF: {how_to_install('vqf')}."
+NO_PEERS = "No ratios, they need VQF: pip install vqf."
 TIMED = ("01", "16", "25")  # recordings of BROAD: slow rotation, fast translation, tapping
 STATIC_S = (0.5, 4.5)  # [s] in which the sensor is static, in BROAD and in the simulated trial
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import BodyModel, load_model
-from wepose_pin.body.links import compute_link_poses
+from wepose_pin.body.kinematics import compute_link_poses
 
 TABLE = load_model().table
 SEGMENTS = tuple(TABLE.segments)

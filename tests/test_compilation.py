@@ -23,7 +23,7 @@ def _fresh(code: str, notices: int = 0, **environment: str) -> str:
 
 
 def test_compiled_once_and_kept(tmp_path: Path) -> None:
-    announced = "from wepose_pin.compilation import announce_compilation\nannounce_compilation()\n" + _FIRST_USE
+    announced = "import sys\nsys.stderr.isatty = lambda: True\n" + _FIRST_USE
     assert _fresh(announced, notices=1, NUMBA_CACHE_DIR=str(tmp_path)) == "(0.0, 0.0, 1.0)\n"
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb*")}
     assert kept

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import load_model, population_subject, simulate, simulate_person, track
 from wepose_pin.body.configuration import compute_pose
-from wepose_pin.body.links import compute_point_covariances
+from wepose_pin.body.kinematics import compute_point_covariances
 from wepose_pin.writers import write_session
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]

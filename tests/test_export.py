@@ -167,7 +167,7 @@ def test_c3d_on_a_full_disk_leaves_the_earlier_file(
         Path(path).write_bytes(Path(path).read_bytes()[:-512])
 
     monkeypatch.setattr(ezc3d.c3d, "write", write)
-    with pytest.raises(ExistingOutput, match=r"x\.c3d: cannot be written: the disk seems to be full"):
+    with pytest.raises(OSError, match="the disk seems to be full"):
         export(result, tmp_path / "x.c3d", force=True)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("x.c3d", "earlier")]
 

@@ -16,7 +16,7 @@ from test_export_robot import place_by_pinocchio, read_positions, write_trajecto
 
 from wepose_pin import Pose, WeposeError, export, load_model
 from wepose_pin.body.configuration import solve_configuration
-from wepose_pin.body.links import compute_link_poses
+from wepose_pin.body.kinematics import compute_link_poses
 
 pytest.importorskip("rosbags")
 

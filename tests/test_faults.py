@@ -86,8 +86,6 @@ def test_a_full_disk(
     assert code == 2, captured.err
     assert captured.err.count("\n") == 1
     assert "too large" in captured.err.lower()
-    if "export" in words:
-        assert f"{command[-1]}: cannot be written: " in captured.err
     assert [path.name for path in tmp_path.rglob("*")] == (["out"] if "OUT/" in words else [])
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import BodyModel, load_model
 from wepose_pin.body.configuration import solve_configuration
-from wepose_pin.body.links import compute_link_poses
+from wepose_pin.body.kinematics import compute_link_poses
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Person, simulate
 from wepose_pin.tracking import track

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import BodyModel, load_model
 from wepose_pin.body.configuration import compute_pose, solve_configuration
-from wepose_pin.body.links import compute_link_poses
+from wepose_pin.body.kinematics import compute_link_poses
 
 CORE = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]
 SEGMENTS = [*CORE, "pelvis", "head", "left_hand", "right_hand"]

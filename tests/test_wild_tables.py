@@ -67,15 +67,6 @@ def epoch_ns(path: Path) -> None:
     path.write_text("\t".join(["timestamp", *names]) + "\n" + "\t".join(units) + "\n" + lines(time, columns, "\t"))
 
 
-def two_lines(path: Path) -> None:
-    """Sensors in one line, each above the first of its columns, and signals in the next; units in the names."""
-    upper = ["", "chest", *[""] * 5, "left wrist", *[""] * 5]
-    lower = ["time [us]", *[f"Acc {a} [m/s²]" for a in "xyz"], *[f"Gyro {a} [rad/s]" for a in "xyz"]]
-    table = np.column_stack([values(k) for k in range(2)])
-    text = ",".join(upper) + "\n" + ",".join(lower + lower[1:]) + "\n"
-    path.write_text(text + lines([str(10_000 * k) for k in range(N)], table, ","), encoding="utf-8")
-
-
 def dates(path: Path) -> None:
     """Dates in place of times, and what a robot's messages call their fields."""
     fields = ("linear_acceleration", "angular_velocity")
@@ -92,7 +83,6 @@ def dates(path: Path) -> None:
         (windows, 0.0, "'Zeit (ms)' is in ms, as its name says: 100 Hz"),
         (epoch_ms, EPOCH, "'unix_timestamp' is in ms, as it grows by 10 from row to row: 100 Hz"),
         (epoch_ns, EPOCH, "'timestamp' is in ns, as its name says: 100 Hz"),
-        (two_lines, 0.0, "'time [us]' is in us, as its name says: 100 Hz"),
         (dates, 0.0, "'timestamp' holds dates; by the first and the last of them: 100 Hz"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),

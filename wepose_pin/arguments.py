@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -153,23 +153,26 @@ def _show(value: Any) -> str:
     return f"array {value.shape} of {value.dtype}" if isinstance(value, np.ndarray) else repr(value)[:60]
 
 
-def check_array(place: str, values: Any, shape: tuple[int, ...], kinds: str = "fiu", rows: str = "") -> None:
-    """Raise `BadData` where `values` is no array of that shape with a type of NumPy's `kinds`; `rows` ends the text."""
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds:
-        kind = "bool" if kinds == "b" else "real numbers"
+def check_array(
+    place: str,
+    values: Any,
+    shape: tuple[int, ...],
+    rows: str = "",
+    *,
+    flags: bool = False,
+    missing: bool = False,
+    unit: float = np.inf,
+) -> None:
+    """Raise `BadData` where `values` is no array of that shape of finite numbers, or NaN where they may be `missing`.
+
+    `rows` ends the text; `flags`: an array of bool is needed; `unit`: by how much the length of quaternions (…, 4) or
+    directions (…, 3) may differ from 1
+    """
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in ("b" if flags else "fiu"):
+        kind = "bool" if flags else "real numbers"
         raise BadData(f"{place} = {_show(values)}: a NumPy array of {kind}, {shape}, is needed")
     if values.shape != shape:
         raise BadData(f"{place} has the shape {values.shape}; {shape} is needed{rows}")
-
-
-def check_numbers(
-    place: str, values: Any, shape: tuple[int, ...], rows: str = "", *, missing: bool = False, unit: float = np.inf
-) -> None:
-    """Check as `check_array`, and that numbers are finite, or NaN where they may be `missing`.
-
-    `unit` : by how much the length of quaternions (…, 4) or directions (…, 3) may differ from 1
-    """
-    check_array(place, values, shape, rows=rows)
     wrong = np.isinf(values) if missing else ~np.isfinite(values)
     if wrong.any():
         k = tuple(int(i) for i in np.argwhere(wrong)[0])
@@ -182,15 +185,8 @@ def check_numbers(
             raise BadData(f"{place}: no {what}: length {length.flat[int(np.argmax(off))]:.6g}")
 
 
-def check_names(place: str, names: Collection[str], known: Collection[str]) -> None:
-    """Raise `BadOption` where a name is not known."""
+def check_names(place: str, names: Iterable[str], known: Collection[str], error: type[Exception] = BadOption) -> None:
+    """Raise an `error` where a name is not known."""
     for name in names:
         if name not in known:
-            raise BadOption(f"{place}: '{name}' is not known; {one_of(known, name)}")
-
-
-def format_settings(value: Any) -> str:
-    """``Class(name=value)`` in one line, for `__repr__`: the fields of a dataclass that differ from their defaults."""
-    chosen = {each.name: getattr(value, each.name) for each in fields(value)}
-    changed = [f"{each.name}={chosen[each.name]!r}" for each in fields(value) if chosen[each.name] != each.default]
-    return f"{type(value).__name__}({', '.join(changed)})"
+            raise error(f"{place}: '{name}' is not known; {one_of(known, name)}")

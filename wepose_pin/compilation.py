@@ -21,28 +21,22 @@ _BARE = _OPTIONS | ({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})
 
 
 class _CompilationNotice(Listener):  # type: ignore[misc]
-    """Prints a line when the first of our functions is compiled; unless `always`, on a terminal only."""
+    """Prints a line on a terminal when the first of our functions is compiled."""
 
-    printed, always = False, False
+    printed = False
 
     def on_start(self, event: Event) -> None:
         if self.printed or not event.data["dispatcher"].py_func.__module__.startswith("wepose_pin."):
             return
         self.printed = True
-        if self.always or sys.stderr.isatty():
+        if sys.stderr.isatty():
             print("compiling the filters for this machine, once: 10 to 30 seconds …", file=sys.stderr, flush=True)
 
     def on_end(self, event: Event) -> None:
         pass
 
 
-_NOTICE = _CompilationNotice()
-register("numba:compile", _NOTICE)
-
-
-def announce_compilation() -> None:
-    """From here on say that functions are compiled, also where nobody sits at a terminal."""
-    _NOTICE.always = True
+register("numba:compile", _CompilationNotice())
 
 
 def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:

@@ -1,7 +1,7 @@
 """Tables of numbers: CSV and Parquet into polars, and their columns into float arrays.
 
 A CSV has its columns separated by commas, semicolons or tabs; beside the last two decimals may have commas. Lines
-before the names, a line of units after them, and names in two lines are read too: `read_layout` finds them.
+before the names and a line of units after them are read too: `read_layout` finds them.
 """
 
 from __future__ import annotations
@@ -203,37 +203,15 @@ def read_layout(path: Path) -> CsvLayout:
     separator = next((sign for sign in ";\t" if 2 * sum(sign in line for _, line in text) > len(text)), ",")
     with library_errors(path, "a CSV"):
         rows = [next(csv.reader([line], delimiter=separator), []) for _, line in text]
-    first, last, units = _find_names(rows)
-    return CsvLayout(_join_names(rows[first:last]), units, separator, text[last if units else last - 1][0] + 1)
-
-
-def _find_names(rows: Sequence[list[str]]) -> tuple[int, int, list[str]]:
-    """Find the lines of names, from and to, and the cells of the line of units after them."""
     filled = [[cell.strip() for cell in cells if cell.strip()] for cells in rows]
 
     def share(k: int, pattern: re.Pattern[str]) -> float:
         return sum(map(bool, map(pattern.fullmatch, filled[k]))) / max(len(filled[k]), 1)
 
-    numeric = next((k for k in range(1, len(rows)) if len(filled[k]) > 1 and share(k, _NUMBER) > 0.5), None)
-    if numeric is None:
-        return 0, 1, []
-    width = len(rows[numeric])
-    has_units = numeric > 1 and len(rows[numeric - 1]) == width and share(numeric - 1, _UNITS) >= 0.5
-    last = numeric - 1 if has_units else numeric
-    first = last - 1
-    if first and len(rows[first]) == width == len(rows[first - 1]) and len(set(filled[first])) < len(filled[first]):
-        first -= 1  # names in two lines: sensors above, their axes below
-    elif first and not has_units and len(rows[0]) == width <= 2 * len(filled[0]):
-        return 0, 1, []  # text in the first rows
-    return first, last, rows[numeric - 1] if has_units else []
-
-
-def _join_names(lines: Sequence[list[str]]) -> list[str]:
-    """Join the names of two lines, the upper one of which may name a sensor in the first of its columns alone."""
-    if len(lines) == 1:
-        return lines[0]
-    upper, names = "", []
-    for owner, name in zip(*lines, strict=True):
-        upper = owner.strip() or upper
-        names.append(f"{upper} {name.strip()}".strip())
-    return names
+    numeric = next((k for k in range(1, len(rows)) if len(filled[k]) > 1 and share(k, _NUMBER) > 0.5), 1)
+    width, above, units = len(rows[min(numeric, len(rows) - 1)]), numeric - 1, list[str]()
+    if above and len(rows[above]) == width and share(above, _UNITS) >= 0.5:
+        units = rows[above]
+    elif len(rows[0]) == width <= 2 * len(filled[0]):  # text in the first rows
+        above = 0
+    return CsvLayout(rows[above - bool(units)], units, separator, text[above][0] + 1)

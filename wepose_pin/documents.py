@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -22,15 +21,15 @@ import numpy as np
 
 from .arguments import Range, check_value, describe
 from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
+from .libraries import check_file
 
 R = TypeVar("R")
+Finite = Annotated[float, Range(-1e300, closed=True, high=1e300)]
 
 
 def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> dict[str, Any]:
     """Read a TOML file, which holds `what`; raise `MissingFile`, or where it is not TOML an `error`."""
-    if not path.is_file():
-        state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
-        raise MissingFile(f"{path}: {state}; {what} is wanted here")
+    check_file(path, what)
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))  # some editors write a byte-order mark
     except OSError as failure:
@@ -83,7 +82,8 @@ class TomlTable:
             raise self.error(f"{self.at(key)} = {value!r} is no list of tables; write [[{self.place}{key}]]")
         return [replace(self, values=each, place=f"{self.place}{key} {k + 1}.") for k, each in enumerate(value)]
 
-    def _get(self, key: str, default: Any, hint: Any) -> Any:
+    def get(self, key: str, default: Any, hint: Any) -> Any:
+        """Return a value that its annotation takes; `default` where the key is missing."""
         value = self.values.get(key, default)
         if value is not None:
             check_value(self.at(key), value, hint, self.error)
@@ -91,14 +91,14 @@ class TomlTable:
 
     def text(self, key: str, default: str | None) -> str | None:
         """Return a text that is not empty; `default` where the key is missing."""
-        value: str | None = self._get(key, default, str)
+        value: str | None = self.get(key, default, str)
         if value == "" != default:
             raise self.error(f"{self.at(key)} is empty; write a text, or leave it out")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of texts, or the one that stands in its place; empty where the key is missing."""
-        value = self._get(key, (), str | tuple[str, ...])
+        value = self.get(key, (), str | tuple[str, ...])
         return (value,) if isinstance(value, str) else tuple(value)
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
@@ -109,15 +109,6 @@ class TomlTable:
             raise self.error(f"{self.at(key)} {state}; {one_of(choices, value)}")
         return value
 
-    def flag(self, key: str) -> bool:
-        """Return true or false; false where the key is missing."""
-        return bool(self._get(key, False, bool))
-
-    def number(self, key: str, default: float | None) -> float | None:
-        """Return a finite number; `default` where the key is missing."""
-        value = self._get(key, default, _FINITE)
-        return None if value is None else float(value)
-
     def names(self, key: str, count: int) -> list[str]:
         """Return a list of `count` different names of columns."""
         value = self.values.get(key)
@@ -126,9 +117,6 @@ class TomlTable:
             state = "is missing" if value is None else f"= {value!r}"
             raise self.error(f"{self.at(key)} {state}; a list of {count} different column names is needed")
         return value
-
-
-_FINITE = Annotated[float, Range(-1e300, closed=True, high=1e300)]
 
 
 def is_number(value: Any, below: float = 1e300) -> TypeGuard[float]:
@@ -162,12 +150,7 @@ def format_toml(values: Mapping[str, Any], place: str = "") -> Iterator[str]:
 
 # Records -----------------------------------------------------------------------------------------------------------
 
-# Unit in a file → to SI, and back.
-_UNITS: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
-    "deg": (math.radians, math.degrees),
-    "deg_min": (lambda value: math.radians(value) / 60.0, lambda value: 60.0 * math.degrees(value)),
-    "mm": (lambda value: 1e-3 * value, lambda value: 1e3 * value),
-}
+_TO_SI = {"deg": math.pi / 180.0, "deg_min": math.pi / 180.0 / 60.0, "mm": 1e-3}  # of units in a file
 
 
 @dataclass(frozen=True)
@@ -271,7 +254,7 @@ def _convert(value: Any, key: Key) -> Any:
     """Convert what stands in a file: numbers to SI, lists to tuples."""
     if isinstance(value, list):
         return tuple(_convert(each, key) for each in value)
-    return value if isinstance(value, str | bool) else _UNITS.get(key.unit, (float,))[0](value)
+    return value if isinstance(value, str | bool) else _TO_SI.get(key.unit, 1.0) * value
 
 
 def format_record(record: Any) -> dict[str, Any]:
@@ -301,14 +284,13 @@ def _format_value(key: Key, value: Any) -> Any:
         return toml_string(value)
     if isinstance(value, bool):
         return str(value).lower()
-    if key.unit in _UNITS:
-        value = round(_UNITS[key.unit][1](value), 6 if key.digits is None else key.digits)
+    if key.unit in _TO_SI:
+        value = round(value / _TO_SI[key.unit], 6 if key.digits is None else key.digits)
     return repr(float(value)) if key.digits is None else f"{value:.{key.digits}f}"
 
 
 # Atomic output -------------------------------------------------------------------------------------------------------
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 written: list[Path] = []  # complete output folders, for the message of a command that is interrupted
 
 
@@ -333,8 +315,7 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
     try:
         partial = own / "whole"  # with the user's usual permissions
         partial.mkdir()
-        with _report_full_disk(out):
-            yield partial
+        yield partial
         _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
         if out.exists():
             targets = {path: out / path.relative_to(partial) for path in sorted(partial.rglob("*"))}
@@ -367,32 +348,18 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
 
     Raise `ExistingOutput` where `file` exists and `force` is false, or it cannot be written.
     """
-    check_file(file, force)
+    check_output(file, force)
     partial = file.with_name(f".{file.name}.partial")
     try:
-        with _report_full_disk(file):
-            yield partial
+        yield partial
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def check_file(file: Path, force: bool = False) -> None:
+def check_output(file: Path, force: bool = False) -> None:
     """Raise `ExistingOutput` where `file` exists and `force` is false, or it cannot be a file."""
     if file.exists() and not force:
         raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
     if file.is_dir() or not file.absolute().parent.is_dir():
         raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
-
-
-@contextmanager
-def _report_full_disk(out: Path) -> Iterator[None]:
-    """Raise an error that names the output when the disk is full; the system's error names no file, or an input."""
-    try:
-        yield
-    except Exception as error:
-        # An error of polars has the system's text but no number.
-        if getattr(error, "errno", None) in _FULL or any(os.strerror(number) in str(error) for number in _FULL):
-            why = getattr(error, "strerror", None) or str(error)
-            raise ExistingOutput(f"{out}: cannot be written: {why}; nothing was written") from error
-        raise

@@ -149,11 +149,6 @@ def reason(error: Exception) -> str:
     return f"{type(error).__name__}: {text[:200]}" if text else type(error).__name__
 
 
-def how_to_install(*packages: str) -> str:
-    """The command that brings packages which are missing, of an installed wheel and of a clone alike."""
-    return f"pip install {' '.join(packages)}"
-
-
 def one_of(names: Iterable[str], value: str | None = None, most: int = 12) -> str:
     """The choices for an error's end: ``a, b, c``, of more than `most` those nearest to `value`, and a guess."""
     choices = list(names)

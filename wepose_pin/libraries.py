@@ -13,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from .errors import BadData, BadOption, MissingFile, WeposeError, how_to_install, native_stderr_muted, reason
+from .errors import BadData, BadOption, MissingFile, WeposeError, native_stderr_muted, reason
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -33,15 +33,9 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
     What this package brings is registered in the same way, in pyproject.toml. It stands first, and its names are taken.
     """
-    registered = sorted(
-        entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin.")
-    )
-    if not registered or not registered[0].value.startswith("wepose_pin."):
-        raise BadOption(f"no {group} of wepose-pin are registered: install the package again")
-    plugins: dict[str, EntryPoint] = {}
-    for each in registered:
-        plugins.setdefault(each.name, each)
-    return plugins
+    registered = entry_points(group=f"wepose.{group}")
+    own = {each.name: each for each in registered if each.value.startswith("wepose_pin.")}
+    return own | {each.name: each for each in registered if each.name not in own}
 
 
 @cache
@@ -66,7 +60,7 @@ def import_library(module: str, path: Path | str, kind: str) -> Any:
         return importlib.import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise BadData(f"{path}: is {kind}, which needs {package}: {how_to_install(package)}") from None
+        raise BadData(f"{path}: is {kind}, which needs {package}: pip install {package}") from None
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..documents import whole_file
-from ..errors import BadData, BadOption, ExistingOutput, MissingFile, WeposeError, how_to_install, reason
+from ..errors import BadData, BadOption, ExistingOutput, MissingFile, WeposeError, reason
 from ..writers.provenance import list_named_files
 
 DONE_FILE = "done.json"  # written last: a folder without it is not complete
@@ -28,7 +28,7 @@ def _open_filesystem(url: str) -> Iterator[tuple[Any, str]]:
     try:
         import fsspec
     except ImportError as error:
-        raise BadOption(f"{url}: {error}: {how_to_install('fsspec')}") from None
+        raise BadOption(f"{url}: {error}: pip install fsspec") from None
     try:
         yield fsspec.core.url_to_fs(url, use_listings_cache=False)  # a worker lives longer than listings stay true
     except WeposeError:

@@ -26,7 +26,7 @@ import numpy as np
 import polars as pl
 
 from ..commands.command_line import parse
-from ..errors import BadOption, ExistingOutput, LostWorker, WeposeError, how_to_install, reason
+from ..errors import BadOption, ExistingOutput, LostWorker, WeposeError, reason
 from ..filters.base import count_processors
 from ..writers.provenance import code, file_hashes
 from ..writers.result import as_json
@@ -135,8 +135,7 @@ def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Gene
     try:
         from distributed import Client, KilledWorker
     except ImportError as error:
-        remedy = how_to_install("dask", "distributed")
-        raise BadOption(f"wepose batch --scheduler: {error}: {remedy}") from None
+        raise BadOption(f"wepose batch --scheduler: {error}: pip install dask distributed") from None
     try:
         client = Client(address, timeout=CONNECT_S)
     except (OSError, ValueError, TypeError) as error:

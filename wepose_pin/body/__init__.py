@@ -9,7 +9,7 @@ not travel. Other joints stay as they are.
 frames; `body` is what they make (`BodyModel`).
 A person's numbers stand in `subject`, those of all people in `anthropometry`; `mounts` finds how sensors are mounted
 from the start pose. `configuration` solves for joints and points from orientations of segments (`KinematicsSolver`),
-which make a `Pose` (`kinematics`); `links` places links and points and says how well they are known.
+which make a `Pose`; `kinematics` has that, places links and points and says how well they are known.
 """
 
 from .anthropometry import SEXES, convert_breadths, list_breadths

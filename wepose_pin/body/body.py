@@ -47,6 +47,11 @@ class BodyModel:
     joints : child link of a spherical joint → its Pinocchio joint
     axes : the same → (3, 3) the axes that were joined, a row each, in the joint's frame at zero; without an entry for
         a `floating` joint
+    chains : segment → the joints that set its orientation, by Pinocchio's numbers, from the root outwards, in the order
+        of these. A segment of a limb is set by the joints nearest to it, as many as make three axes; others above (a
+        clavicle) rest. One of the spine is set by all joints between it and the segment above. There are none where it
+        is rigid with that
+    parents : segment → the segment above it; None for the first. On one joint the others hang on the first
     girdles : girdle → (7,) what a person differs by from its law, `girdle.PARAMETERS`; zeros where it is not named
     personal : segment → its properties with a person's own means of soft tissue and start pose, which are corrected;
         a segment that is not named is as of all people
@@ -57,6 +62,8 @@ class BodyModel:
     table: BodyTable
     joints: Mapping[str, int]
     axes: Mapping[str, np.ndarray]
+    chains: Mapping[str, tuple[int, ...]]
+    parents: Mapping[str, str | None]
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
     personal: Mapping[str, Segment] = field(default_factory=dict)
 
@@ -84,25 +91,6 @@ class BodyModel:
     def lengths(self) -> dict[str, float]:
         """The lengths [m] that this model has, measured on it in the neutral configuration."""
         return measure_lengths(self.robot, self.table)
-
-    @property
-    def chains(self) -> dict[str, tuple[int, ...]]:
-        """Segment → the joints that set its orientation, by Pinocchio's numbers, from the root outwards.
-
-        A segment of a limb is set by the joints nearest to it, as many as make three axes; others above (a clavicle)
-        rest. A segment of the spine is set by all joints between it and the segment above. There are none where it is
-        rigid with that. Segments are in the order of Pinocchio's joints.
-        """
-        return self._chains_and_parents[0]
-
-    @property
-    def parents(self) -> dict[str, str | None]:
-        """Segment → the segment above it; None for the first. On one joint the others hang on the first."""
-        return self._chains_and_parents[1]
-
-    @cached_property
-    def _chains_and_parents(self) -> tuple[dict[str, tuple[int, ...]], dict[str, str | None]]:
-        return _find_chains(self.pin, self.table)
 
     def find_spherical(self, segment: str) -> int | None:
         """Find the spherical joint nearest to a segment, which takes what its other joints leave; None: it has none.
@@ -182,25 +170,22 @@ class BodyModel:
 
 def _find_chains(model: pin.Model, table: BodyTable) -> tuple[dict[str, tuple[int, ...]], dict[str, str | None]]:
     """Find `BodyModel.chains` and `BodyModel.parents`."""
-    frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
-    at: dict[int, str] = {}  # joint → the first of the segments that it carries; the others are rigid with that
-    for segment, frame in frames.items():
-        at.setdefault(frame.parentJoint, segment)
-    paths: dict[str, tuple[str | None, list[int]]] = {}  # segment → the one above, and the joints between
-    for joint, segment in at.items():
+    joint_of = {name: model.frames[model.getFrameId(name)].parentJoint for name in table.segments}
+    first = {joint: name for name, joint in reversed(joint_of.items())}  # the others on a joint are rigid with that
+    chains, parents, between = dict[str, tuple[int, ...]](), dict[str, str | None](), dict[str, list[int]]()
+    for name, joint in joint_of.items():
         path = model.supports[joint].tolist()
-        below = max((k for k, other in enumerate(path[:-1]) if other in at), default=None)
-        paths[segment] = (None, path[1:]) if below is None else (at[path[below]], path[below + 1 :])
+        above = [other for other in (path[:-1] if first[joint] == name else path) if other in first]
+        parents[name] = first[above[-1]] if above else None
+        between[name] = path[path.index(above[-1]) + 1 :] if above else path[1:]
     # A joint that moves two segments at once rests.
-    times = Counter(joint for _, joints in paths.values() for joint in joints)
-    chains, parents = dict[str, tuple[int, ...]](), dict[str, str | None]()
-    for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
-        parents[segment], joints = paths.get(segment, (at[frame.parentJoint], []))
-        free = [j for j in joints if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
-        while not table.segments[segment].spine and sum(model.nvs[joint] for joint in free[1:]) >= 3:
+    times = Counter(joint for joints in between.values() for joint in joints)
+    for name in sorted(joint_of, key=lambda name: joint_of[name]):
+        free = [j for j in between[name] if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
+        while not table.segments[name].spine and sum(model.nvs[joint] for joint in free[1:]) >= 3:
             del free[0]
-        chains[segment] = tuple(free)
-    return chains, {name: parents[name] for name in frames}
+        chains[name] = tuple(free)
+    return chains, parents
 
 
 def load_model(path: str | Path | None = None, lengths: Mapping[str, float] | None = None) -> BodyModel:
@@ -307,4 +292,4 @@ _load_packaged_body = lru_cache(_load_body)  # read once; a `BodyModel` does not
 
 def _build_body(robot: Any, table: BodyTable, where: str) -> BodyModel:
     model, joints, axes = build(robot, where, spherical=not table.is_mechanism)
-    return BodyModel(model, robot, table, joints, axes)
+    return BodyModel(model, robot, table, joints, axes, *_find_chains(model, table))

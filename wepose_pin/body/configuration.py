@@ -22,8 +22,7 @@ from ..errors import BadData, BadModel
 from ..rotations import conjugate, exp, log, multiply, product, rotation_about, unwrap_signs
 from .body import BodyModel
 from .girdle import follow_law
-from .kinematics import Pose
-from .links import compute_joint_values, compute_link_poses, describe_girdle, find_columns, find_known_points
+from .kinematics import Pose, compute_joint_values, compute_link_poses, describe_girdle, find_columns, find_known_points
 from .table import check_segments
 
 _MEET_TOLERANCE = 1e-6  # [m] between joints of one place

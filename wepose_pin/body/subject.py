@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import NonNegative, Range, check_arguments, check_fields, check_names, check_numbers
+from ..arguments import NonNegative, Range, check_arguments, check_array, check_fields, check_names
 from ..documents import (
+    Finite,
     Key,
     TomlTable,
     format_record,
@@ -150,10 +151,10 @@ class Subject:
             check_names(f"{where}covariance.order", named, self.lengths)
             if len(set(self.order)) < len(self.order):
                 raise BadData(f"{where}covariance.order names a row twice")
-            check_numbers(f"{where}covariance", self.covariance, (len(self.order),) * 2)
+            check_array(f"{where}covariance", self.covariance, (len(self.order),) * 2)
             for name, (values, size) in arrays.items():
                 unit = 1e-3 if name.startswith(("mounts", "hinges")) else np.inf
-                check_numbers(f"{where}{name}", values, (size,), unit=unit)
+                check_array(f"{where}{name}", values, (size,), unit=unit)
                 if name.startswith(("start_pose_offset", "heading_drift")) and values[-1] < 0.0:
                     raise BadData(f"{where}{name}[{size - 1}] = {values[-1]:g}: a standard deviation is at least 0")
         except (BadData, BadOption) as error:
@@ -408,7 +409,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     table.allow("order", "matrix")
     std.allow(*subject.lengths)
     order = table.texts("order") if table.values else tuple(name for name in subject.lengths if name in std)
-    covariance = np.diag([(std.number(name, 0.0) or 0.0) ** 2 for name in order])
+    covariance = np.diag([float(std.get(name, 0.0, Finite)) ** 2 for name in order])
     if table.values:
         try:
             covariance = np.array(table.values.get("matrix"), dtype=float)

@@ -122,7 +122,6 @@ def live(
     speed
         With --source replay: replay at this multiple of the recording's own speed; max is as fast as possible.
     """
-    from ..compilation import announce_compilation
     from ..live import find_setup, open_source, run_session
     from ..live.guide import GuideOptions, choose_protocol
     from ..live.robot import RobotOutput, read_robot
@@ -133,7 +132,6 @@ def live(
     for option, value in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if value is not None and not guide:
             raise BadOption(f"--{option}: goes with --guide, which is not given")
-    announce_compilation()  # a stream is waiting
     # A wrong robot is found before the person does anything.
     commands, receiver = (None, "") if robot is None else read_robot(robot)
     replays = source.startswith("replay:")

@@ -36,7 +36,7 @@ def view(
     """
     import webbrowser
 
-    from ..documents import check_file, whole_file
+    from ..documents import check_output, whole_file
     from ..report.viewer import pose_html
     from ..writers import load_result, select_pose
 
@@ -47,7 +47,7 @@ def view(
     if not (result / "pose.parquet").is_file():
         raise MissingFile(f"{result}: no pose.parquet in it; a folder that `wepose track` wrote is needed")
     if out is not None or force or not page.is_file():
-        check_file(page, force)
+        check_output(page, force)
         with progress_bar() as progress:
             progress("making the page", 0.0)
             tracked = load_result(result)

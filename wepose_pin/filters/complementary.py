@@ -19,7 +19,7 @@ import numpy as np
 from ..arguments import NonNegative
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
-from ..rotations import derivative, rotate_by_vector, up_in_sensor
+from ..rotations import product, rotate_by_vector, up_in_sensor
 from .base import FilterParams, OrientationFilter, make_record
 from .noise import SensorNoise
 
@@ -63,7 +63,7 @@ def _step_ncf(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-
 def _step_gdc(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
     quat, bias, dt = state.quat_VS, state.gyro_bias, model.dt
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
-    dx, dy, dz, dw = derivative(x, y, z, w, gx - bias[0], gy - bias[1], gz - bias[2])
+    dx, dy, dz, dw = product(x, y, z, w, 0.5 * (gx - bias[0]), 0.5 * (gy - bias[1]), 0.5 * (gz - bias[2]), 0.0)
     norm = np.sqrt(ax * ax + ay * ay + az * az)
     if 0.0 < norm < np.inf:  # in free fall there is no direction to descend
         ux, uy, uz = up_in_sensor(quat)

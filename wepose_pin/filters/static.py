@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
-from ..arguments import NonNegative, Range, check_fields, format_settings
+from ..arguments import NonNegative, Range, check_fields
 from ..compilation import inlined, kernel
 from ..errors import BadOption
 from .base import make_record
@@ -65,9 +65,6 @@ class StaticTest:
     gamma1: NonNegative = 0.01
     gamma2: NonNegative = 0.01
     rate_stds: float = 3.0
-
-    def __repr__(self) -> str:
-        return format_settings(self)
 
     def __post_init__(self) -> None:
         check_fields(self, "")

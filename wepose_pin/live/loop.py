@@ -17,7 +17,7 @@ import numpy as np
 
 from ..body import BodyModel, load_table
 from ..body.configuration import KinematicsSolver
-from ..body.links import compute_axis_std
+from ..body.kinematics import compute_axis_std
 from ..body.mounts import compute_start_configuration
 from ..body.soft_tissue import make_correction
 from ..body.subject import parse_subject

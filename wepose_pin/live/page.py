@@ -37,7 +37,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from ..body import BodyModel
 from ..body.configuration import KinematicsSolver
-from ..body.links import find_known_links
+from ..body.kinematics import find_known_links
 from ..errors import BadOption
 from ..report.viewer import DARK, LIGHT, choose_trail_colour, fill_page, find_floor, scene, view
 from ..retargeting.targets import find_person_arm

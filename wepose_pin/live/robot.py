@@ -15,7 +15,7 @@ import numpy as np
 from ..body import BodyTable, load_table
 from ..body.subject import Subject, population_subject
 from ..diagnostics import WARNING, Diagnostic
-from ..documents import TomlTable, read_toml
+from ..documents import Finite, TomlTable, read_toml
 from ..errors import BadOption, WrongOption
 from ..retargeting import Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
@@ -192,7 +192,7 @@ def read_robot(name: str) -> tuple[CommandStream, str]:
     robot = str(keys.text("robot", None))
     neighbour = file.parent / robot
     margins, timing = (
-        {key: float(keys.number(key, None) or 0.0) for key in names if key in keys} for names in (MARGINS, TIMING)
+        {key: float(keys.get(key, None, Finite)) for key in names if key in keys} for names in (MARGINS, TIMING)
     )
     sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
     try:

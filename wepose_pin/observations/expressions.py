@@ -19,7 +19,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..body.girdle import PARAMETERS, make_law
-from ..body.links import find_carrier
+from ..body.kinematics import find_carrier
 from ..body.mounts import StartPose
 from ..body.table import HingeJoint
 from ..body.tree import UNIVERSE

@@ -21,7 +21,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel
-from ..body.links import find_carrier
+from ..body.kinematics import find_carrier
 
 BAND_HZ = (0.1, 1.5)  # what people move in
 LEAST_RATE_HZ = 20.0  # of recordings that are used

@@ -15,7 +15,7 @@ import polars as pl
 from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..documents import Key, TomlTable, is_number, read_record, read_toml, toml_key, toml_string
+from ..documents import Finite, Key, TomlTable, is_number, read_record, read_toml, toml_key, toml_string
 from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printable
 from ..recording import (
     CONFIGURATION,
@@ -132,9 +132,9 @@ def read_head(top: TomlTable) -> Recording:
         sensors={},
         phases=_read_phases(top.table("phases", {})),
         start_pose=start_pose,
-        joints={joint: joints.number(joint, None) or 0.0 for joint in joints.values},
+        joints={joint: float(joints.get(joint, 0.0, Finite)) for joint in joints.values},
         model=_find_model(path, top),
-        remounted=top.flag("remounted"),
+        remounted=top.get("remounted", False, bool),
         source=path,
         truth=None if truth is None else path.parent / truth,
     )
@@ -169,7 +169,9 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
     """Read the keys of a sensor; those that its table lacks are those of [data]."""
     keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))._replace(table=table)
     if "time" in table or "rate_hz" in table:  # one replaces the other
-        keys = keys._replace(time=table.text("time", None) or "", rate_hz=table.number("rate_hz", None))
+        keys = keys._replace(
+            **{key: SensorKeys._field_defaults[key] for key in ("time", "rate_hz") if key not in table}
+        )
     if "mount" in table:
         axes = table.table("mount")
         axes.allow("up", "forward")

@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import escape
 
 from ..angles import Angles
-from ..body.links import compute_axis_std
+from ..body.kinematics import compute_axis_std
 from ..diagnostics import Diagnostic
 from ..documents import whole_file
 from ..errors import reason

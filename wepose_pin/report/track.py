@@ -8,7 +8,7 @@ import numpy as np
 
 from ..angles import Angles, summary
 from ..body import BodyTable
-from ..body.links import compute_axis_std
+from ..body.kinematics import compute_axis_std
 from ..recording import format_span
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.measures import (

@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from ..angles import AUTO, Angles, joint_angles
 from ..body import BodyModel, Visual
 from ..body.configuration import solve_configuration
-from ..body.kinematics import Pose
-from ..body.links import compute_link_placements, find_known_links
+from ..body.kinematics import Pose, compute_link_placements, find_known_links
 from ..errors import BadData
 from .page import load_template
 from .words import plain

@@ -22,7 +22,7 @@ import pinocchio as pin
 
 from ..arguments import NonNegative
 from ..compilation import compiled
-from ..errors import WeposeError, how_to_install
+from ..errors import WeposeError
 from .collision import NEAR, CollisionModel, NearPairs
 from .limits import (
     compute_acceleration_bounds,
@@ -120,7 +120,7 @@ class QpController:
         try:
             import daqp
         except ImportError:
-            raise WeposeError(f"retargeting needs daqp: {how_to_install('daqp')}") from None
+            raise WeposeError("retargeting needs daqp: pip install daqp") from None
         self._solve, robot = daqp.solve, self.robot
         self.data: Any = robot.model.createData()
         n = len(robot.names)

@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline, interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..body import BodyTable, Limb, load_table
-from ..body.kinematics import Pose
-from ..body.links import compute_axis_std
+from ..body.kinematics import Pose, compute_axis_std
 from ..errors import BadData, WrongOption
 from ..filters.butterworth import low_pass
 from .robot import Arm, Robot

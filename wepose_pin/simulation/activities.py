@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from ..arguments import Count, Positive, check_arguments
 from ..body import BodyModel, load_model
 from ..body.girdle import FIXED
-from ..body.links import compute_link_poses
+from ..body.kinematics import compute_link_poses
 from ..errors import BadOption, one_of
 from ..rotations import compose, turn_about
 from .arm_tasks import Activity, ArmTasks

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_fields, format_settings
+from ..arguments import check_fields
 from ..errors import BadOption
 
 
@@ -88,9 +88,6 @@ class Imperfections:
     clock_drift_ppm: float = 0.0
     dropped: float = 0.0
     accel_average: float = 0.0
-
-    def __repr__(self) -> str:
-        return format_settings(self)
 
     def __post_init__(self) -> None:
         check_fields(self, "")

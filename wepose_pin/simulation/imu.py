@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from ..arguments import NonNegative, Positive, format_settings
+from ..arguments import NonNegative, Positive
 from ..errors import BadOption
 from .imperfections import Imperfections
 
@@ -38,9 +38,6 @@ class ImuNoise:
     accel_bias_std: NonNegative = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
     accel_bias_instability: NonNegative = 0.03e-3 * GRAVITY  # [m/s^2]
     correlation_s: Positive = 100.0  # [s], of the in-run biases
-
-    def __repr__(self) -> str:
-        return format_settings(self)
 
 
 MTI_3 = ImuNoise()

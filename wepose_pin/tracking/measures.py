@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel, BodyTable
-from ..body.kinematics import Pose
-from ..body.links import compute_point_covariances
+from ..body.kinematics import Pose, compute_point_covariances
 from ..body.subject import Subject
 from ..recording import OrientationSensor, Recording, compute_rate, find_runs
 from ..recording.faults import find_saturation

@@ -16,7 +16,7 @@ from ..body.configuration import solve_configuration
 from ..body.kinematics import Pose, build_pose_table, find_usual_rate
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic, notebook_html
-from ..errors import BadData, Named, WeposeError, how_to_install
+from ..errors import BadData, Named, WeposeError
 from ..recording import Intervals, Mark, Recording
 from .headings import HeadingCorrection
 from .segment_orientations import SegmentOrientations
@@ -130,7 +130,7 @@ class TrackResult:
         try:
             import pandas
         except ImportError:
-            raise WeposeError(f"to_pandas: needs pandas: {how_to_install('pandas')}") from None
+            raise WeposeError("to_pandas: needs pandas: pip install pandas") from None
         table = self.to_dataframe()
         return pandas.DataFrame({name: table[name].to_numpy() for name in table.columns})
 

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..body.configuration import compute_orientation_residuals
-from ..body.kinematics import Pose, join_poses
-from ..body.links import find_undetermined_joints
+from ..body.kinematics import Pose, find_undetermined_joints, join_poses
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, drop_consequences, gravest_first, merge
 from ..filters import STATIC_ONLY, Orientation, join_orientations
 from ..recording import Recording, find_runs

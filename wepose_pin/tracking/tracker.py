@@ -19,7 +19,7 @@ from .. import rotations
 from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.configuration import KinematicsSolver
-from ..body.links import compute_point_covariances
+from ..body.kinematics import compute_point_covariances
 from ..body.mounts import (
     MEASURED_ORIENTATION_STD,
     align_sensors,

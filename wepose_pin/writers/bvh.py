@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..body.configuration import solve_configuration
-from ..body.links import compute_link_poses, find_known_points
+from ..body.kinematics import compute_link_poses, find_known_points
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..rotations import conjugate, multiply

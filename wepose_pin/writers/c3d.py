@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.configuration import solve_configuration
-from ..body.links import compute_link_poses, find_known_links
+from ..body.kinematics import compute_link_poses, find_known_links
 from ..errors import BadData
 from ..libraries import import_library
 from ..tracking import TrackResult

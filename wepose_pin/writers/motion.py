@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..angles import NEAR_LOCK, euler
 from ..body import BodyModel
 from ..body.configuration import compute_pose, solve_configuration
-from ..body.kinematics import find_usual_rate
-from ..body.links import compute_joint_values
+from ..body.kinematics import compute_joint_values, find_usual_rate
 from ..body.tree import joint_axis, parse_tree
 from ..body.urdf import read_urdf
 from ..data_tables import read_columns, read_table

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..body.urdf import Mesh, package_folders, reduce_triangles, triangulate
-from ..errors import BadOption, how_to_install, native_stderr_muted
+from ..errors import BadOption, native_stderr_muted
 from .motion import ROBOT_URDF, JointMotion, compute_link_poses_W
 
 TIMELINE = "time"
@@ -25,7 +25,7 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     try:
         import rerun as rr
     except ImportError:
-        raise BadOption(f"--format rrd: needs rerun: {how_to_install('rerun-sdk')}") from None
+        raise BadOption("--format rrd: needs rerun: pip install rerun-sdk") from None
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{motion.name} {motion.time[0]:g}", send_properties=False)
     recording.save(path)
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

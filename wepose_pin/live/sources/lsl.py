@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import BadSource, how_to_install, one_of
+from ...errors import BadSource, one_of
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 from ...recording.arrivals import Samples
 from ..state import join_names
@@ -151,7 +151,7 @@ def configure_pylsl() -> Any:
     try:
         import pylsl
     except (ImportError, RuntimeError) as error:  # RuntimeError: pylsl is there and finds no liblsl
-        raise BadSource(f"lsl: needs pylsl ({error}): {how_to_install('pylsl')}") from None
+        raise BadSource(f"lsl: needs pylsl ({error}): pip install pylsl") from None
     if not os.environ.get("LSLAPICFG"):
         pylsl.set_config_content(THIS_MACHINE)
     return pylsl
