@@ -78,8 +78,8 @@ def calibrate(
     from ..readers import load_session
     from ..report import calibration as report_room
     from ..report.page import write_pages
-    from ..writers.calibration import write_calibration
     from ..writers.provenance import collect_provenance, result_folder
+    from ..writers.result import write_calibration
 
     if prior is not None and (stature is not None or sex is not None):
         raise WrongOption(

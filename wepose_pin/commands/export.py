@@ -40,9 +40,7 @@ def export(
     out
         Write this file. Its suffix selects the format.
     """
-    options = dict(locals())
     from ..writers import export as room
-    from ..writers.provenance import collect_provenance
 
     with progress_bar() as progress:
         progress("writing", 0.0)
@@ -58,7 +56,6 @@ def export(
             instruction=instruction,
             osim_model=osim_model,
             force=force,
-            provenance=collect_provenance("export", options),
         )
     print_diagnostics(written.diagnostics)
     say(f"Written: {out}  ({written.format})")

@@ -1,8 +1,7 @@
-"""Writers: one file a format."""
+"""Writers: our own folders, and the formats of other programs."""
 
 from __future__ import annotations
 
-from .result import load_result, select_pose
-from .session import write_session
+from .result import load_result, select_pose, write_session
 
 __all__ = ["load_result", "select_pose", "write_session"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -22,7 +22,7 @@ from ..libraries import check_file, find_plugins, load_plugin
 from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
-from .lerobot import write_lerobot
+from .joints import write_lerobot, write_mcap, write_rosbag, write_rrd
 from .motion import (
     ROBOT_URDF,
     TRAJECTORY,
@@ -34,10 +34,8 @@ from .motion import (
     resample_joints,
 )
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
-from .provenance import data_folder, write_provenance
+from .provenance import data_folder
 from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
-from .ros import write_mcap, write_rosbag
-from .rrd import write_rrd
 
 Result = TrackResult | HasJointMotion | str | Path
 # What a format is of: a person's motion; joints of a person or a robot; motions of robots; a body without a motion.
@@ -133,7 +131,6 @@ def export(
     instruction: str | None = None,
     osim_model: str | Path | None = None,
     force: bool = False,
-    provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
     """Write a motion, or the body that moves, to a file for other programs. On an error no part of it is left.
 
@@ -168,8 +165,6 @@ def export(
         Placer and IMU Inverse Kinematics. Without it scale names Rajagopal_2015.osim.
     force : bool
         Replace an existing file, or a data set of the same format.
-    provenance : mapping, optional
-        What made the result (command, options, versions), written as JSON beside the file, or into the folder.
 
     Returns
     -------
@@ -217,13 +212,7 @@ def export(
             setups = [files.enter_context(whole_file(path, force)) for path in list_setups(file)]
             write_setups(file, setups, motions[0], str(own.pop("osim_model")))
         source = results[0] if kind.of == BODY else motions if kind.of == ROBOTS else motions[0]
-        written = Exported(name, kind.write(partial, source, **own) or [])
-        if provenance is not None and kind.earlier:
-            write_provenance(partial, provenance)
-        elif provenance is not None:
-            record = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
-            write_provenance(record.parent, provenance, record.name)
-    return written
+        return Exported(name, kind.write(partial, source, **own) or [])
 
 
 def _is_of_robot(result: Result) -> bool:

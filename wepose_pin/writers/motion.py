@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -69,22 +69,14 @@ def resample(motion: TrackResult, rate_hz: float) -> TrackResult:
     time = np.minimum(make_times(old, rate_hz), old[-1])
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])
-
-    def between(cov: np.ndarray) -> np.ndarray:
-        w = share[:, None, None]
-        return (1.0 - w) * cov[after - 1] + w * cov[after]
-
+    w, first, last = share[:, None, None], share < 1.0 - 1e-6, share > 1e-6  # samples to which the old ones contribute
     quat_WL = {name: Slerp(old, Rotation.from_quat(quat))(time).as_quat() for name, quat in pose.quat_WL.items()}
-    gaps = {
-        name: (gap[after - 1] & (share < 1.0 - 1e-6)) | (gap[after] & (share > 1e-6)) for name, gap in pose.gap.items()
+    parts: dict[str, Any] = {
+        name: {each: (1.0 - w) * cov[after - 1] + w * cov[after] for each, cov in getattr(pose, name).items()}
+        for name in ("segment_cov", "point_cov")
     }
-    new = replace(
-        compute_pose(motion.model, time, quat_WL),
-        segment_cov={name: between(cov) for name, cov in pose.segment_cov.items()},
-        point_cov={name: between(cov) for name, cov in pose.point_cov.items()},
-        gap=gaps,
-    )
-    return replace(motion, pose=new)
+    parts["gap"] = {name: (gap[after - 1] & first) | (gap[after] & last) for name, gap in pose.gap.items()}
+    return replace(motion, pose=replace(compute_pose(motion.model, time, quat_WL), **parts))
 
 
 def check_complete(motion: TrackResult, format_name: str) -> None:
@@ -109,8 +101,8 @@ def find_measured_points(motion: TrackResult) -> dict[str, np.ndarray]:
     """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged; `BadData`: none is known."""
     pose = motion.pose
     if not pose.points:
-        first = motion.model.table.reference
-        raise BadData(f"{motion.where}: no points in pose.parquet, for lack of a sensor on the {first}")
+        lacking = f"for lack of a sensor on the {motion.model.table.reference}"
+        raise BadData(f"{motion.where}: no points in pose.parquet, {lacking}")
     points = {}
     for point, p_W in pose.points.items():
         lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]
@@ -153,16 +145,14 @@ class JointMotion:
         return str(parse_tree(self.robot, self.where).root)
 
     @cached_property
-    def ordered(self) -> tuple[Any, ...]:
+    def ordered(self) -> list[Any]:
         """The URDF's joints depth first, in the order of the file, as MuJoCo numbers them."""
-        below = parse_tree(self.robot, self.where).below
-
-        def walk(link: str) -> Iterator[Any]:
-            for joint in below[link]:
-                yield joint
-                yield from walk(joint.child)
-
-        return tuple(walk(self.root))
+        ordered, below = [], parse_tree(self.robot, self.where).below
+        waiting = [*reversed(below[self.root])]
+        while waiting:
+            ordered.append(joint := waiting.pop())
+            waiting += reversed(below[joint.child])
+        return ordered
 
     @property
     def moving(self) -> tuple[str, ...]:

@@ -38,14 +38,15 @@ GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
 # people, whose orientations are exact, are missed by 3 to 7 deg, of a real recording by up to 9.
 MOST_MISSED = np.deg2rad(12.0)
 # OpenSim's ground G: x forward, y up, z right.
-_R_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-# The axis of `pro_sup_r` in the humerus (Rajagopal_2015.osim); the left one is mirrored on the sagittal plane.
-_PRONATION = np.array([0.05639803, 0.99840646, 0.001952])
+QUAT_GW = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).as_quat()
 _MODEL = tomllib.loads(Path(__file__).with_name("rajagopal.toml").read_text(encoding="utf-8"))
 BODIES: Mapping[str, str] = _MODEL["bodies"]
 LENGTHS: Mapping[str, Mapping[str, Any]] = _MODEL["lengths"]
 # Axes of a right arm's elbow and wrist in the body above; a left arm's are mirrored on the sagittal plane.
-_AXES = (0.22604696, 0.022269, 0.97386183), _PRONATION, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+_AXES = [
+    np.array(axis) / np.linalg.norm(axis)
+    for axis in [(0.22604696, 0.022269, 0.97386183), (0.05639803, 0.99840646, 0.001952), (0, 0, 1), (1, 0, 0)]
+]
 # Their coordinates, and the middle of each range [rad]: angles are given within half a turn of it. Followed over time,
 # an elbow that was once bent as none can be might keep a full turn too much.
 _MIDDLE = {"elbow_flex": np.radians(75.0), "pro_sup": np.radians(90.0), "wrist_flex": 0.0, "wrist_dev": 0.0}
@@ -67,23 +68,22 @@ def write_mot(path: Path, motion: TrackResult, names: str | None = None) -> list
             raise BadOption(f"--names {names}: {motion.where} is of a mechanism, whose joints have their own names")
         slides = {joint.name for joint in motion.model.robot.joints if joint.type == "prismatic"}
         others = {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
-    else:
-        if names != "opensim":
-            isb = joint_angles(motion.pose)
-            diagnostics += diagnose_lock(isb)
-            for name, joint in isb.joints.items():
-                angles |= {f"{name}_{angle}": joint[angle] for angle in joint}
-                others[f"{name}_near_lock"] = joint.near_lock.astype(int)
-        if names != "isb":
-            opensim, residuals = coordinates(orientations(motion.pose.quat_WL))
-            angles |= opensim
-            diagnostics += [
-                Diagnostic("orientation-residual", WARNING, body, angle, MOST_MISSED, {"variant": "opensim"})
-                for body, angle in residuals.items()
-                if angle > MOST_MISSED
-            ]
-        if not angles:
-            raise BadData(f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles")
+    elif names != "opensim":
+        isb = joint_angles(motion.pose)
+        diagnostics += diagnose_lock(isb)
+        for name, joint in isb.joints.items():
+            angles |= {f"{name}_{angle}": joint[angle] for angle in joint}
+            others[f"{name}_near_lock"] = joint.near_lock.astype(int)
+    if not motion.pose.joints and names != "isb":
+        opensim, residuals = coordinates(orientations(motion.pose.quat_WL))
+        angles |= opensim
+        missed = {body: angle for body, angle in residuals.items() if angle > MOST_MISSED}
+        facts: dict[str, float | str] = {"variant": "opensim"}
+        diagnostics += [
+            Diagnostic("orientation-residual", WARNING, *each, MOST_MISSED, facts) for each in missed.items()
+        ]
+    if not angles and not motion.pose.joints:
+        raise BadData(f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles")
     rows = pl.DataFrame({"time": motion.pose.time, **{k: np.degrees(v) for k, v in angles.items()}, **others})
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     header = [name, "version=1", f"nRows={rows.height}", f"nColumns={rows.width}", "inDegrees=yes", "endheader"]
@@ -178,7 +178,7 @@ def write_trc(path: Path, motion: TrackResult) -> None:
     columns = {
         f"{point}_{axis}": 1e3 * p_G
         for point, p_W in points.items()
-        for axis, p_G in zip("XYZ", in_ground(p_W).T, strict=True)
+        for axis, p_G in zip("XYZ", (p_W[:, [0, 2, 1]] * [1.0, 1.0, -1.0]).T, strict=True)
     }
     rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
     _write_rows(path, [*header, ""], rows, labels=False)
@@ -200,21 +200,15 @@ def _write_rows(path: Path, header: Sequence[str], rows: pl.DataFrame, labels: b
 # Rajagopal's model ---------------------------------------------------------------------------------------------------
 
 
-def in_ground(p_W: np.ndarray) -> np.ndarray:
-    """Return vectors (n, 3) of W in G."""
-    return np.column_stack([p_W[:, 0], p_W[:, 2], -p_W[:, 1]])
-
-
 def orientations(quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute body → `quat_GB` (n, 4) xyzw, of the segments that are bodies of the model.
 
     The N-pose, palms to the thighs, is the model with 90° of `pro_sup` and zero of all others.
     """
-    quat_GW, pronated = _R_GW.as_quat(), _PRONATION / np.linalg.norm(_PRONATION) * np.pi / 2.0
-    bodies = {}
+    bodies, pronated = {}, _AXES[1] * np.pi / 2.0
     for segment, body in BODIES.items():
         if segment in quat_WL:
-            moved = multiply(multiply(quat_GW, quat_WL[segment]), conjugate(quat_GW))
+            moved = multiply(multiply(QUAT_GW, quat_WL[segment]), conjugate(QUAT_GW))
             n_pose = pronated * float(body.startswith(("radius", "hand"))) * ([-1, -1, 1] if body.endswith("_l") else 1)
             bodies[body] = multiply(moved, Rotation.from_rotvec(n_pose).as_quat())
     return bodies
@@ -234,11 +228,11 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
         angles = euler.follow(euler.decompose(quat, "ZXY"), "ZXY", NEAR_LOCK)
         columns.update(zip(names, angles.T, strict=True))
 
+    pelvis = quat_GB.get("pelvis", np.array([0.0, 0.0, 0.0, 1.0]))
     if "pelvis" in quat_GB:
-        add(quat_GB["pelvis"], ("pelvis_tilt", "pelvis_list", "pelvis_rotation"))
+        add(pelvis, ("pelvis_tilt", "pelvis_list", "pelvis_rotation"))
     if "torso" in quat_GB:
-        lumbar = multiply(conjugate(quat_GB.get("pelvis", np.array([0.0, 0.0, 0.0, 1.0]))), quat_GB["torso"])
-        add(lumbar, ("lumbar_extension", "lumbar_bending", "lumbar_rotation"))
+        add(multiply(conjugate(pelvis), quat_GB["torso"]), ("lumbar_extension", "lumbar_bending", "lumbar_rotation"))
     for side in "rl":
         arm = [name for body in ("humerus", "radius", "hand") if (name := f"{body}_{side}") in quat_GB]
         if not arm or arm[0] != f"humerus_{side}":
@@ -263,16 +257,14 @@ def _fit_arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list
     And how far each body is off; angles are (n,) [rad]. By turns the joints take the angles that are the best for the
     radius, and the radius the mean of where the measured bodies put it: each lessens the sum of the squared angles.
     """
-    axes = [np.array(axis) / np.linalg.norm(axis) for axis in _AXES]
     humerus, radius = quat[:2]
     pace = 1.5 if len(quat) > 2 else 1.0  # where joints follow the radius on both sides, its mean lags behind
     for _ in range(_ROUNDS):
-        angles = _solve_two_axes(axes[0], axes[1], multiply(conjugate(humerus), radius))
-        elbow = multiply(rotation_about(axes[0], angles[0]), rotation_about(axes[1], angles[1]))
+        angles, elbow = _solve_two_axes(_AXES[:2], multiply(conjugate(humerus), radius))
         placed = [multiply(humerus, elbow), quat[1]]
         if len(quat) > 2:
-            angles += _solve_two_axes(axes[2], axes[3], multiply(conjugate(radius), quat[2]))
-            wrist = multiply(rotation_about(axes[2], angles[2]), rotation_about(axes[3], angles[3]))
+            more, wrist = _solve_two_axes(_AXES[2:], multiply(conjugate(radius), quat[2]))
+            angles += more
             placed.append(multiply(quat[2], conjugate(wrist)))
         off = [Rotation.from_quat(multiply(conjugate(radius), each)).as_rotvec() for each in placed]
         step = pace * np.mean(off, axis=0)
@@ -284,12 +276,13 @@ def _fit_arm(quat: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], list
     return multiply(radius, conjugate(elbow)), angles, [np.linalg.norm(each, axis=1) for each in off]
 
 
-def _solve_two_axes(a: np.ndarray, b: np.ndarray, quat: np.ndarray) -> list[np.ndarray]:
-    """Compute the angles (n,) [rad] about two axes that come nearest to rotations (n, 4).
+def _solve_two_axes(axes: Sequence[np.ndarray], quat: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """Compute the angles (n,) [rad] about two axes, and their rotation (n, 4), that come nearest to rotations (n, 4).
 
     The scalar product of the two quaternions is a cosine of half their difference and one of half their sum, summed.
     """
-    v, w = quat[:, :3], quat[:, 3]
+    (a, b), v, w = axes, quat[:, :3], quat[:, 3]
     m = v @ np.cross(a, b) - w * (a @ b)
     difference, total = np.arctan2(v @ (a - b), w + m), np.arctan2(v @ (a + b), w - m)
-    return [total + difference, total - difference]
+    angles = [total + difference, total - difference]
+    return angles, multiply(rotation_about(a, angles[0]), rotation_about(b, angles[1]))

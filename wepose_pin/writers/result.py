@@ -1,6 +1,8 @@
-"""The result folder: ``pose.parquet``, ``subject.toml``, ``subject.urdf``, ``summary.json``.
+"""Folders of ours: a recording with its session, a calibration, and a result, which is read again.
 
-With a body other than the upper body also ``model.toml``, its table; of a mechanism also ``joints.parquet``.
+A result has ``pose.parquet``, ``subject.toml``, ``subject.urdf``, ``summary.json``; with a body other than the upper
+body also ``model.toml``, its table; of a mechanism also ``joints.parquet``. A calibration has ``calibration.json`` in
+place of the pose and the summary.
 """
 
 from __future__ import annotations
@@ -27,17 +29,115 @@ from ..body import BodyModel, load_model, load_table
 from ..body.kinematics import Pose, build_pose_table, find_samples, parse_pose_table
 from ..body.subject import Subject, load_subject, subject_toml
 from ..body.table import MODEL_TABLE, format_table
+from ..calibration import Calibration
 from ..data_tables import read_columns, read_table
+from ..diagnostics import as_json as diagnostic_as_json
 from ..diagnostics import from_json
+from ..documents import toml_key
 from ..errors import MissingFile
 from ..libraries import library_errors
-from ..recording import Intervals, Mark, select_interval
+from ..readers.session import format_keys
+from ..recording import ImuSensor, Intervals, Mark, Recording, find_mount_axes, select_interval
 from ..tracking import TrackResult, TrackSummary
 
 POSE = "pose.parquet"
 JOINTS = "joints.parquet"
 SUBJECT_URDF = "subject.urdf"
 ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
+MOST_POINTS = 600  # of the residual of a calibration over time
+
+
+def write_session(folder: Path, recording: Recording, truth: Pose | None = None) -> None:
+    """``session.toml``, ``recording.parquet`` and, with a truth, ``truth.parquet`` into an existing folder."""
+    model = str(Path(recording.model).absolute()) if Path(recording.model).is_file() else recording.model
+    head = {"name": recording.name, "model": model, "start_pose": recording.start_pose}
+    data = {"file": "recording.parquet", "time": "time", "gyro_unit": "rad/s", "accel_unit": "m/s^2"}
+    spans = {
+        name: [[round(float(time), 3) for time in span] for span in each] for name, each in recording.phases.items()
+    }
+    tables: dict[str, Mapping[str, Any]] = {
+        "data": data | ({} if truth is None else {"truth": "truth.parquet"}),
+        "phases": spans,
+        "joints": {name: float(value) for name, value in recording.joints.items()},
+    }
+    columns = {"time": recording.time}
+    for segment, sensor in recording.sensors.items():
+        if isinstance(sensor, ImuSensor):
+            signals = {"gyro": ("gyr_", sensor.gyro_S), "accel": ("acc_", sensor.accel_S)}
+        else:
+            signals = {"orientation": ("q", sensor.quat_VS)}
+        keys: dict[str, Any] = {}
+        for key, (short, values) in signals.items():
+            keys[key] = [f"{segment}_{short}{c}" for c in "xyzw"[: values.shape[1]]]
+            columns |= {column: values[:, k] for k, column in enumerate(keys[key])}
+        if sensor.aligned:
+            keys["aligned"] = True
+        if sensor.stated_quat_LS is not None:
+            keys["mount"] = dict(zip(("up", "forward"), find_mount_axes(sensor.stated_quat_LS), strict=True))
+        tables[f"sensors.{toml_key(segment)}"] = keys
+    lines = format_keys({key: value for key, value in head.items() if value})
+    lines += ["remounted = true"] if recording.remounted else []
+    for name, own in tables.items():
+        lines += ["", f"[{name}]", *format_keys(own)] if own else []
+    write_table(folder / "recording.parquet", pl.DataFrame(columns))
+    if truth is not None:
+        write_table(folder / "truth.parquet", build_pose_table(truth))
+    (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_calibration(folder: Path, calibration: Calibration, provenance: Mapping[str, Any]) -> None:
+    """Write the subject and ``calibration.json``, with the provenance, into an existing folder."""
+    write_subject(folder, calibration.subject, calibration.subject.shape(calibration.problem.model))
+    content = {**as_json(_document(calibration)), "versions": versions(), "provenance": dict(provenance)}
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _document(calibration: Calibration) -> dict[str, Any]:
+    """The content of ``calibration.json``; lengths [m], times [s], angles as named, checks and diagnostics SI."""
+    subject, quality = calibration.subject, calibration.quality
+    some = slice(None, None, -(-len(calibration.time) // MOST_POINTS))
+    return {
+        "quality": quality.quality,
+        "diagnostics": [diagnostic_as_json(diagnostic) for diagnostic in quality.diagnostics],
+        "checks": [
+            {"code": check.diagnostic.code, "place": check.diagnostic.place, "quality": check.quality}
+            | {"value": _number(check.value), "passes": check.passes, "poor": check.poor}
+            for check in quality.checks
+        ],
+        "protocol": calibration.problem.protocol.name,
+        "measured": {name: metres for name, (metres, _) in calibration.problem.measured.items()},
+        "scale_std": _number(calibration.scale_std),
+        "lengths": {n: {"value": v, "std": _number(subject.std(n))} for n, v in subject.lengths.items()},
+        "mounts": {
+            segment: {
+                **{key: float(v) for key, v in zip(("qx", "qy", "qz", "qw"), quat, strict=True)},
+                "std_deg": [_number(np.degrees(subject.std(f"mounts.{segment}.{axis}"))) for axis in "xyz"],
+            }
+            for segment, quat in subject.mounts.items()
+        },
+        "start_pose_offset_deg": {name: np.degrees(offset[:2]) for name, offset in subject.start_pose_offset.items()},
+        "heading_drift_deg_min": {name: 60.0 * np.degrees(drift[0]) for name, drift in subject.heading_drift.items()},
+        "hinges": {
+            joint: {"axis": subject.hinges[joint].axis, "rms_deg": _number(np.degrees(rms))}
+            for joint, rms in calibration.hinge_rms.items()
+        },
+        "gap_rms": {"after": _number(calibration.rms_gap), "before": _number(calibration.prior_rms_gap)},
+        "gap": {
+            "time": calibration.time[some].round(3),
+            "after": [_number(v) for v in calibration.gap[some]],
+            "before": [_number(v) for v in calibration.prior_gap[some]],
+            "contact": calibration.contact[some].round(3),
+        },
+        "open_intervals": calibration.open_intervals,
+        "effective_sample_size": calibration.effective_sample_size,
+        "moved": dict(calibration.exchanged),
+    }
+
+
+def _number(value: float) -> float | None:
+    """None where it is not finite, which JSON cannot say."""
+    return float(value) if np.isfinite(value) else None
 
 
 def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = False) -> None:
