@@ -17,7 +17,7 @@ They are states, so that a long recording does not average them away.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -232,10 +232,8 @@ class HeadingFilter:
 
     def step(
         self, quat_WL: np.ndarray, sides: np.ndarray, clasped: np.ndarray, lost: np.ndarray, filters: np.ndarray
-    ) -> Iterator[None]:
+    ) -> None:
         """Predict to the end of a knot of m samples with uncorrected headings, and update by its observations.
-
-        It yields between parts of a millisecond or two; the state is valid after the last one.
 
         Parameters
         ----------
@@ -247,7 +245,6 @@ class HeadingFilter:
         """
         self.process = self._find_process(filters, lost)
         self.predict(self.process)
-        yield
         unreliable = lost | self._lost_before  # after a loss the tilt may be wrong
         palms = self.palms if clasped.any() else None
         if palms is not None and unreliable[[self.names.index(name) for name in palms.segments]].any():
@@ -257,18 +254,15 @@ class HeadingFilter:
             self._matrix, self._vector = np.zeros(self.P.shape), np.zeros(x.shape)
             misfits = self._add_joints(x, sides, lost)
             self._add_biases(x, filters)
-            yield
-            yield from self._add_hinges(x, quat_WL, unreliable)
+            self._add_hinges(x, quat_WL, unreliable)
             if palms is not None:
                 correlated = max(1.0, CLOSURE_CORRELATION_S * self.rate_hz)
                 if self.causal and not self._clasped_before:
                     # Causally all of a clasp's first knot is one observation: a clasp may be shorter than that.
                     correlated = float(len(quat_WL))
                 self._add_gap(palms.linearize(quat_WL[clasped], x[: len(lost)]), correlated)
-                yield
             right = self.P @ (self._matrix @ (x - self.x) - self._vector)
             x = np.asarray(self.x + np.linalg.solve(identity + self.P @ self._matrix, right))
-            yield
         self.x, self.P = x, symmetric(np.linalg.solve(identity + self.P @ self._matrix, self.P))
         self._misfits, self._clasped_before, self._last, self._lost_before = misfits, bool(clasped.any()), filters, lost
 
@@ -353,8 +347,8 @@ class HeadingFilter:
             self._add(columns, H, r, weight)
         return misfits
 
-    def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> Iterator[None]:
-        """Add the hinges and their ranges; yield between them."""
+    def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> None:
+        """Add the hinges and their ranges."""
         samples = max(1.0, HINGE_CORRELATION_S * self.rate_hz)
         for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
             moves, on = columns[:2]
@@ -367,7 +361,6 @@ class HeadingFilter:
             self._add(columns, H, r, is_inlier / (std**2 * samples))
             beyond = (excess != 0.0) / (RANGE_STD**2 * samples)
             self._add(columns[:2], slope[:, None] * [1.0, -1.0], excess, beyond)
-            yield
 
     def _add_gap(self, rows: tuple[np.ndarray, ...], correlated: float) -> None:
         """Add the gap between the palms, without outliers; so many samples are one observation."""

@@ -2,12 +2,12 @@
 
 The filters' tilt is good and their headings drift. Time is cut into intervals of equal length, the knots, and
 `heading_filter` estimates one error of each heading a knot; an error common to all segments is unobservable. Offline a
-Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is corrected in the next one.
+Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is corrected over the next one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -21,9 +21,6 @@ from ..observations.joint_accelerations import BAND_HZ, compute_sides
 from .heading_filter import HeadingFilter, symmetric
 
 E_Z = np.array([0.0, 0.0, 1.0])
-# Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
-# several gaps); over the rest its correction fades in.
-SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
 
 
 @dataclass(frozen=True)
@@ -84,8 +81,7 @@ class HeadingCorrection:
 class HeadingCorrector:
     """Corrects headings as samples come, or by `smooth` after the last one.
 
-    Causally a complete knot is solved in parts, with samples between, so that no pose waits for long. From the sample
-    `lead` of the next knot on, by which all parts are done, the correction fades in. Offline nothing is corrected yet.
+    Causally the correction by a complete knot fades in over the next one. Offline nothing is corrected yet.
 
     Parameters
     ----------
@@ -93,7 +89,6 @@ class HeadingCorrector:
 
     Attributes
     ----------
-    fade : how the correction fades in: from and to (k,) [rad], number of the next sample, number of samples
     variance : (3, k) [rad²] after the last knot: variances of each segment's heading and of its filter's alone, and
         the squared correction of the headings since the start or the last reset
     """
@@ -104,32 +99,26 @@ class HeadingCorrector:
         # Of the joint accelerations: their band-pass, and the last two samples of the last knot.
         self._band: tuple[np.ndarray, np.ndarray] | None = None
         self._last_R_WS, self._last_accel_S = np.zeros((2, k, 3, 3)), np.zeros((2, k, 3))
-        self._size = self.filter.stride * self.filter.samples_per_knot
-        self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if self.filter.causal else 0
+        self._size, self._count = self.filter.stride * self.filter.samples_per_knot, 0  # samples of the open knot
         self._quat_VS, self._accel_S = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
         self._clasped = np.zeros(self._size, dtype=bool)
-        self._count = 0  # samples in the open knot
-        self._solving: Iterator[None] | None = None  # the last knot, until it is done
-        self._knot_end: float | None = None  # [s] of the last knot; None: its result is not collected
         self._from, self._to, self._at_reset = np.zeros((3, k))
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
-        self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot that is solved
+        self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
         # Of each knot: causally what was corrected, as `HeadingFilter.estimate`; offline x, P, and what led to them.
         self._history: list[tuple[Any, ...]] = []
-        self._update_estimate()
-        self._update_variance()
+        self._set_variance(self._estimate()[2])
 
     @property
     def fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
-        if self._count < self._lead:
-            return self._to, self._to, 0, 1
-        return self._from, self._to, self._count - self._lead, self._size - self._lead
+        """How the correction fades in: from and to (k,) [rad], number of the next sample, number of samples."""
+        return self._from, self._to, self._count, self._size
 
     @property
     def remaining(self) -> int:
-        """Number of samples that can be pushed at once: after them `fade` changes, or the knot is complete."""
-        return (self._lead if self._count < self._lead else self._size) - self._count
+        """Number of samples until the knot is complete."""
+        return self._size - self._count
 
     def push(self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray | bool) -> bool:
         """Add up to `remaining` samples; return whether the knot is complete.
@@ -139,41 +128,35 @@ class HeadingCorrector:
         rows = slice(self._count, self._count + len(quat_VS))
         self._quat_VS[rows], self._accel_S[rows], self._clasped[rows] = quat_VS, accel_S, clasped
         self._count += len(quat_VS)
-        if self._solving is not None:
-            if self._count >= self._lead:
-                self._apply()
-            elif self._count % max(1, self._lead // SOLVE_PARTS) == 0:
-                next(self._solving, None)
         return self._count == self._size
 
     def close(self, filters: np.ndarray, end: float | None = None) -> None:
         """Close the open knot; `filters` (4, k) is after its last sample at `end` [s]; None: not collected."""
-        n, self._knot_end = slice(self._count), end
-        self._solving = self._solve(self._quat_VS[n].copy(), self._accel_S[n].copy(), self._clasped[n].copy(), filters)
-        self._count = 0
-        if not self._lead:
-            self._apply()
-
-    def _solve(
-        self, quat_VS: np.ndarray, accel_S: np.ndarray, clasped: np.ndarray, filters: np.ndarray
-    ) -> Iterator[None]:
-        """Estimate the heading errors of a knot, a part at each step of the iterator."""
-        rows, k = slice(None, None, self.filter.stride), len(self.offset)
-        quat_WS = rotations.multiply(self._quat_WV, quat_VS)
-        sides = np.zeros((0, k, 3, 8))
+        n, rows = slice(self._count), slice(None, self._count, self.filter.stride)
+        quat_WS, accel_S = rotations.multiply(self._quat_WV, self._quat_VS[n]), self._accel_S[n]
+        sides = np.zeros((0, *accel_S.shape[1:], 8))
         if self.filter.pairs:
-            R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(-1, k, 3, 3)
+            R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(*quat_WS.shape[:2], 3, 3)
             sides = self._filter_sides(R_WS, accel_S)[rows]
-        lost = ~np.isfinite(accel_S).all(axis=(0, 2))
+        lost = np.asarray(np.isnan(accel_S).any(axis=(0, 2)))
         quat_WL = rotations.multiply(quat_WS[rows], self.filter.quat_SL)
-        yield
-        yield from self.filter.step(quat_WL, sides, clasped[rows], lost, filters)
-        if self.filter.causal:
-            self._update_estimate()
-            self._var_at_knot = np.nan_to_num(filters[0])
-        elif self._knot_end is not None:
-            self._history.append((self.filter.x, self.filter.P, self.filter.process))
-            self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / self.filter.sensor_rate_hz)
+        self.filter.step(quat_WL, sides, self._clasped[rows], lost, filters)
+        last, self._count = self._count - 1, 0
+        if not self.filter.causal:
+            if end is not None:
+                self._history.append((self.filter.x, self.filter.P, self.filter.process))
+                self._times.append(end - 0.5 * last / self.filter.sensor_rate_hz)
+            return
+        errors, covariance, segment_covariance = self._estimate()
+        self._from, self._to, measured = self._to, errors.copy(), self.filter.measured
+        if measured.any() and not self._corrects_measured:
+            self._corrects_measured = exceed_uncertainty(self._to[None], covariance[None])
+            self._to[measured] *= self._corrects_measured
+        if end is not None:
+            self._history.append((self._to, covariance, segment_covariance))
+            self._times.append(end)
+        self._var_at_knot = np.nan_to_num(filters[0])
+        self._set_variance(segment_covariance)
 
     def _filter_sides(self, R_WS: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Return the side B (n, k, 3, 8) of each sensor at its joints, band-passed, one sample late.
@@ -193,43 +176,22 @@ class HeadingCorrector:
         B = compute_sides(R_WS, accel_S, rate_hz)
         return filter_chunk(*self._band, B.reshape(len(B), -1)).reshape(B.shape)
 
-    def _apply(self) -> None:
-        """Finish the last knot; causally its correction fades in from the next sample on."""
-        if self._solving is None:
-            return
-        for _ in self._solving:
-            pass
-        self._solving = None
-        if not self.filter.causal:
-            return
-        errors, covariance, segment_covariance = self._estimate
-        self._from, self._to, measured = self._to, errors.copy(), self.filter.measured
-        if measured.any() and not self._corrects_measured:
-            self._corrects_measured = exceed_uncertainty(self._to[None], covariance[None])
-            self._to[measured] *= self._corrects_measured
-        if self._knot_end is not None:
-            self._times.append(self._knot_end)
-            self._history.append((self._to, covariance, segment_covariance))
-        self._update_variance()
-
     def reset(self, heading_offset: np.ndarray) -> None:
         """Correct the headings to ψ (k,) [rad] at once, as the person shows them by standing in the start pose."""
-        self._apply()
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._to - error) / (2.0 * np.pi))
         self.filter.reset(error)
-        self._update_estimate()
         self._corrects_measured = True
         self._from = self._to = self._at_reset = error
-        self._update_variance()
+        self._set_variance(self._estimate()[2])
 
-    def _update_estimate(self) -> None:
+    def _estimate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         x, P = self.filter.x, self.filter.P
-        self._estimate = self.filter.estimate(x, P, self.filter.find_care(x, P))
+        return self.filter.estimate(x, P, self.filter.find_care(x, P))
 
-    def _update_variance(self) -> None:
-        var = np.diag(self._estimate[2])
-        self.variance = np.array([var, self._var_at_knot, (self._to - self._at_reset) ** 2])
+    def _set_variance(self, segment_covariance: np.ndarray) -> None:
+        correction = self._to - self._at_reset
+        self.variance = np.array([np.diag(segment_covariance), self._var_at_knot, correction**2])
 
     def collect(self, knots: Sequence[tuple[Any, ...]] | None = None) -> HeadingCorrection:
         """Return what was observed and corrected causally so far; or `knots`, as `HeadingFilter.estimate` each."""
