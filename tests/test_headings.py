@@ -185,6 +185,14 @@ def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simu
     assert all(np.array_equal(remounted.quat_WL[name], quat) for name, quat in usual.quat_WL.items())
 
 
+def test_a_turn_is_uncertain_by_the_scale_of_its_gyroscope(made: tuple[Simulation, Subject]) -> None:
+    correction = track(drifting(made[0], {}), made[1]).correction
+    assert correction is not None
+    forward, turn = correction.filter, np.array([0.0, 1.0, -2.0, 30.0, 0.5])
+    covariance = forward.advance(forward.advance(np.eye(len(forward.x)), turn).T, turn)
+    np.testing.assert_allclose(np.diag(covariance)[:5], 1.0 + forward.knot_s**2 + turn**2)
+
+
 @pytest.mark.parametrize("causal", [False, True])
 def test_headings_known_from_each_other_are_uncertain_together(made: tuple[Simulation, Subject], causal: bool) -> None:
     """A limb is turned as a whole: what two segments share, and the covariance of all is one."""

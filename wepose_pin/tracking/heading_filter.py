@@ -1,10 +1,10 @@
 """A Kalman filter of heading errors over knots of a recording: it owns the headings and the biases about the vertical.
 
 Time is cut into intervals of equal length, the knots. δ_i is the heading error of segment i, on the left in W:
-R_WL,true = Rz(δ_i) R_WL. It changes by a random walk and by a rate that changes slowly: the bias about the vertical. An
-orientation filter corrects both by what its own sensor shows, as in a static phase. The headings here are those without
-its corrections, and what it has learned of the bias is one more observation. Differences of two or more δ are observed
-by (`wepose_pin.observations`):
+R_WL,true = Rz(δ_i) R_WL. It changes by a random walk, by the scale of the gyroscope as the segment turns, and by a rate
+that changes slowly, the bias about the vertical. An orientation filter corrects heading and bias by what its own sensor
+shows, as in a static phase. The headings here are those without its corrections, and what it has learned of the bias is
+one more observation. Differences of two or more δ are observed by (`wepose_pin.observations`):
 
 - the acceleration of a joint, which two sensors measure, with their levers as unknowns;
 - a hinge: the long axis of the segment below stays in the plane across the hinge's axis, within its range;
@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 
+from .. import rotations
 from ..body import BodyModel
 from ..body.mounts import (
     PALM_SLIP_STD,
@@ -75,7 +76,8 @@ _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 
 
 # Standard deviations, power spectral densities and correlation times.
-DRIFT_PSD = np.deg2rad(0.12) ** 2  # [rad²/s] of a heading in motion: scale errors, soft tissue
+DRIFT_PSD = np.deg2rad(0.12) ** 2  # [rad²/s] of a heading in motion: soft tissue
+SCALE_STD = 0.002  # of a gyroscope's scale about the vertical; what the filters assume
 RATE_CHANGE_PSD = np.deg2rad(0.1) ** 2 / 900.0  # [rad²/s³] a sensor warms up under its strap
 # [rad] of the heading by a joint's acceleration: soft tissue follows the motion.
 JOINT_STD, JOINT_CORRELATION_S = np.deg2rad(0.5), 60.0
@@ -115,7 +117,8 @@ class HeadingFilter:
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
     stride : sensors' samples from one sample of a knot to the next
     x, P : (n,), (n, n); the first k are δ [rad]
-    process : how x changes in the last knot besides what it does by itself, and the variance of that; (n,) each
+    process : how x changes in the last knot besides what it does by itself, the variance of that; (n,) each; and the
+        rotations (k,) [rad] about the vertical
     """
 
     def __init__(
@@ -173,6 +176,7 @@ class HeadingFilter:
         states = {
             "heading": (np.zeros(k), always),  # δ [rad]
             "rate": (rate_std, always),  # [rad/s] at which δ drifts
+            "scale": (np.full(k, SCALE_STD), always),  # of a gyroscope
             "joint": (joint_std, JOINT_CORRELATION_S),  # [rad] of the heading by a joint's acceleration
             "axis": (axis_std, always),  # [rad] of a hinge about the long axis of the segment above
             "twist": (twist_std, TWIST_CORRELATION_S),  # [rad] of that segment's sensor, the same
@@ -213,6 +217,7 @@ class HeadingFilter:
         self._misfits = np.zeros((len(self.pairs), 16))
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
+        self._last_quat: np.ndarray | None = None  # (1, k, 4) of the last knot
         self._clasped_before = False  # whether the palms were joined in the last knot
 
     def reset(self, headings: np.ndarray) -> None:
@@ -243,7 +248,7 @@ class HeadingFilter:
         lost : (k,) bool: the sensor has lost a sample
         filters : (4, k) at the end
         """
-        self.process = self._find_process(filters, lost)
+        self.process = self._find_process(filters, lost, quat_WL)
         self.predict(self.process)
         unreliable = lost | self._lost_before  # after a loss the tilt may be wrong
         palms = self.palms if clasped.any() else None
@@ -266,13 +271,15 @@ class HeadingFilter:
         self.x, self.P = x, symmetric(np.linalg.solve(identity + self.P @ self._matrix, self.P))
         self._misfits, self._clasped_before, self._last, self._lost_before = misfits, bool(clasped.any()), filters, lost
 
-    def _find_process(self, filters: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find how the state changes within a knot, and the variance of that.
+    def _find_process(
+        self, filters: np.ndarray, lost: np.ndarray, quat_WL: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find how the state changes within a knot, the variance of that, and the rotation about the vertical.
 
-        The heading variance of an orientation filter grows by the bias too, which is a rate here. So its growth counts
-        up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or the gyroscope was saturated.
-        What the filter has corrected of its heading and its bias is taken back. A bias is less certain where another
-        axis of the sensor becomes vertical.
+        The heading variance of an orientation filter grows by the bias and the scale of its gyroscope too, which are
+        states here. So its growth counts up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or
+        the gyroscope was saturated. What the filter has corrected of its heading and its bias is taken back. A bias is
+        less certain where another axis of the sensor becomes vertical.
         """
         heading, rate = self._columns["heading"], self._columns["rate"]
         gained_var, corrected, corrected_rate, gained_rate_var = filters - self._last
@@ -287,19 +294,26 @@ class HeadingFilter:
         drift = np.where(leaps, gained, np.minimum(gained, least))
         variance[heading] += np.where(known, drift, UNKNOWN_DRIFT_PSD * self.knot_s)
         variance[rate] += np.nan_to_num(np.maximum(gained_rate_var, 0.0))
-        return change, variance
+        quat = np.concatenate([quat_WL[:1] if self._last_quat is None else self._last_quat, quat_WL])
+        self._last_quat = quat[-1:]
+        turns = rotations.log(rotations.multiply(quat[1:], rotations.conjugate(quat[:-1])))
+        return change, variance, np.sum(turns[:, :, 2], axis=0)
 
-    def advance(self, values: np.ndarray) -> np.ndarray:
-        """Return F v of one knot for v (n,) or (n, m): correlated states decay, headings change by their rates."""
+    def advance(self, values: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """Return F v of one knot for v (n,) or (n, m); `turn` (k,) [rad] is the rotation about the vertical.
+
+        Correlated states decay, headings change by their rates and by the scales of their gyroscopes.
+        """
         advanced = np.asarray((self._decay * values.T).T)
-        advanced[self._columns["heading"]] += self.knot_s * values[self._columns["rate"]]
+        rate, scale = (values[self._columns[name]].T for name in ("rate", "scale"))
+        advanced[self._columns["heading"]] += (self.knot_s * rate + turn * scale).T
         return advanced
 
-    def predict(self, process: tuple[np.ndarray, np.ndarray]) -> None:
+    def predict(self, process: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
         """Predict state and covariance at the end of the next knot."""
-        change, variance = process
-        self.x = self.advance(self.x) + change
-        self.P = self.advance(self.advance(self.P).T).T + np.diag(variance)
+        change, variance, turn = process
+        self.x = self.advance(self.x, turn) + change
+        self.P = self.advance(self.advance(self.P, turn).T, turn).T + np.diag(variance)
 
     def _add(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, weight: np.ndarray | float) -> None:
         """Add rows 0 = r + H (y − x) + e of these columns of the state y, with weights of one over their variance.

@@ -216,7 +216,7 @@ class HeadingCorrector:
         for before_x, before_P, process_before in self._history[-2::-1]:
             forward.x, forward.P = before_x, before_P
             forward.predict(process)
-            gain = np.linalg.solve(forward.P, forward.advance(before_P)).T
+            gain = np.linalg.solve(forward.P, forward.advance(before_P, process[2])).T
             x = before_x + gain @ (x - forward.x)
             P = symmetric(before_P + gain @ (P - forward.P) @ gain.T)
             estimates.append(forward.estimate(x, P, care))
