@@ -13,19 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.rotations import heading
-from wepose_pin.simulation import (
-    MILD_PRESET,
-    PEOPLE_PRESET,
-    SIDES,
-    Imperfections,
-    Person,
-    Simulation,
-    simulate,
-    simulate_person,
-)
-from wepose_pin.simulation.motion import TASKS, Motion, aim_ray
-from wepose_pin.simulation.people import place_shoulder
+from wepose_pin.simulation import MILD_PRESET, MTI_3, PEOPLE_PRESET, SIDES, Imperfections, Person
+from wepose_pin.simulation.motion import Motion, aim_ray
+from wepose_pin.simulation.people import Flaws, place_shoulder
 from wepose_pin.simulation.signals import Wander, make_pulse
+from wepose_pin.simulation.subject import Simulation, measure_motion, simulate_person
 from wepose_pin.tracking import Tracker, TrackResult, track, track_chunks
 from wepose_pin.tracking.headings import HeadingCorrection
 
@@ -145,8 +137,8 @@ def simulate_free_motion(
     motion: type[FreeMotion], person: Person, seed: int, preset: Imperfections, seconds: float
 ) -> Simulation:
     """Simulate a person whose hands move at random."""
-    TASKS.setdefault(motion.name, motion)
-    return simulate(person.lengths, seed=seed, imperfections=preset, clasp_s=seconds, circles=0, protocol=motion.name)
+    hands = motion(Flaws(preset, seed, person.lengths), [motion.name], seconds, 0)
+    return measure_motion(hands, rate_hz=100.0, noise=MTI_3)
 
 
 def compare_headings(

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.rotations import compose, log, turn_about
 from wepose_pin.simulation import IDEAL_PRESET, MTI_3, Imperfections, ImuNoise
-from wepose_pin.simulation.imu import GRAVITY, Device, jitter_time
-from wepose_pin.simulation.motion import E_Z
+from wepose_pin.simulation.imperfections import GRAVITY, Device, jitter_time
+from wepose_pin.simulation.people import E_Z
 from wepose_pin.simulation.signals import make_pulse
 
 _DURATION_S = 60.0  # of a trial
@@ -114,12 +114,12 @@ def simulate_paper_dynamic(
     R_WS = motion.orientation(own_time)
     turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
     force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
-    device = Device.sample(device_rng, imperfections, warm_up_rng)
+    device = Device(device_rng, imperfections, warm_up_rng)
     rate_S = np.vstack((np.zeros(3), turned))
     readings = device.measure(rate_S, force_S, rate_hz, noise, noise_rng)
     quat_WS, p_WS = motion.orientation(time).as_quat(), motion.position(time)
     static = [(0.0, trial.moving[0]), (trial.moving[1], _DURATION_S)]
-    measured = readings.gyro_S, readings.accel_S, readings.gyro_bias
+    measured = readings["gyro_S"], readings["accel_S"], readings["gyro_bias"]
     return SingleSensor(time, rate_hz, quat_WS, p_WS, *measured, static, trial.moving)
 
 

@@ -72,11 +72,9 @@ def simulate(
     from ..body import DEFAULT_BODY, list_breadths, load_table
     from ..body.subject import mount_rows, subject_toml
     from ..documents import whole_folder
-    from ..simulation.motion import find_task
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
 
-    find_task(protocol or PROTOCOL)
     if activity is not None and protocol is not None:
         raise BadOption(f"--activity {activity} with --protocol {protocol}: one of them; leave one out")
     sizes, changes = room.PRESETS[preset], dict[str, Any](imperfection or {})

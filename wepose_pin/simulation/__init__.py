@@ -10,32 +10,23 @@ By default a perfect world: no soft tissue, an exact N-pose, palms that coincide
 the table, and sensors with noise and bias only. `Imperfections` add those of real people and sensors.
 """
 
-from .activities import ACTIVITIES, simulate_activity
-from .imperfections import IDEAL_PRESET, MILD_PRESET, PEOPLE_PRESET, PRESETS, Imperfections
-from .imu import MTI_3, NOISE_FREE, ImuNoise
-from .motion import CIRCLING_POINT, SEGMENTS
-from .people import SIDES
-from .subject import MEASURED_LENGTHS, MEASURED_STD, PEOPLE_MEASURED_STD, Person, Simulation, simulate, simulate_person
-
-__all__ = [
-    "ACTIVITIES",
-    "CIRCLING_POINT",
-    "IDEAL_PRESET",
-    "MEASURED_LENGTHS",
-    "MEASURED_STD",
-    "MILD_PRESET",
-    "MTI_3",
-    "NOISE_FREE",
-    "PEOPLE_MEASURED_STD",
-    "PEOPLE_PRESET",
-    "PRESETS",
-    "SEGMENTS",
-    "SIDES",
-    "Imperfections",
-    "ImuNoise",
-    "Person",
-    "Simulation",
-    "simulate",
-    "simulate_activity",
-    "simulate_person",
-]
+from .activities import ACTIVITIES as ACTIVITIES
+from .imperfections import IDEAL_PRESET as IDEAL_PRESET
+from .imperfections import MILD_PRESET as MILD_PRESET
+from .imperfections import MTI_3 as MTI_3
+from .imperfections import NOISE_FREE as NOISE_FREE
+from .imperfections import PEOPLE_PRESET as PEOPLE_PRESET
+from .imperfections import PRESETS as PRESETS
+from .imperfections import Imperfections as Imperfections
+from .imperfections import ImuNoise as ImuNoise
+from .motion import CIRCLING_POINT as CIRCLING_POINT
+from .motion import SEGMENTS as SEGMENTS
+from .people import SIDES as SIDES
+from .subject import MEASURED_LENGTHS as MEASURED_LENGTHS
+from .subject import MEASURED_STD as MEASURED_STD
+from .subject import PEOPLE_MEASURED_STD as PEOPLE_MEASURED_STD
+from .subject import Person as Person
+from .subject import Simulation as Simulation
+from .subject import simulate as simulate
+from .subject import simulate_activity as simulate_activity
+from .subject import simulate_person as simulate_person

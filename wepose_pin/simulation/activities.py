@@ -10,27 +10,21 @@ the accelerometers measure.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Collection
 
 import numpy as np
 import pinocchio as pin
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from ..arguments import Count, Positive, check_arguments
-from ..body import BodyModel, load_model
-from ..body.girdle import FIXED
+from ..body import BodyModel
 from ..body.kinematics import compute_link_poses
-from ..errors import BadOption, one_of
+from ..errors import BadOption
 from ..rotations import compose, turn_about
 from .arm_tasks import Activity, ArmTasks
-from .imperfections import IDEAL_PRESET, Imperfections
-from .imu import MTI_3, ImuNoise
-from .motion import ARM, E_Z, STAND_S, BodyPose, place_arm
-from .people import SIDES, Flaws
+from .motion import ARM, STAND_S, place_arm
+from .people import E_Z, SIDES, BodyPose, Flaws
 from .signals import make_pulse, make_step
-from .subject import Simulation, measure_motion, spawn_streams
 
 # Signs by which angles of a right leg, with the names and signs of `angles.JOINTS`, are turns about y, x, z; those of a
 # left one about x and z are of opposite sign.
@@ -42,8 +36,8 @@ class WholeBodyActivity(Activity):
 
     body = "whole_body"
 
-    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
-        super().__init__(model, rng, seconds, flaws)
+    def __init__(self, model: BodyModel, seconds: float, flaws: Flaws) -> None:
+        super().__init__(model, seconds, flaws)
         self._carriers = find_carriers(model)
         lengths = self.lengths
         self.p_LS |= {"pelvis": np.array((-0.1, 0.0, 0.02)), "head": np.array((-0.1, 0.0, 0.15))}
@@ -84,10 +78,10 @@ class WholeBodyActivity(Activity):
         points = {point: p_W[link] for point, link in self.model.point_frames.items() if link in p_W}
         pose, girdle, R_WT = BodyPose(R_WL, points, origins), self.flaws.girdle, R_WL["torso"]
         for side in sides if girdle.size else ():  # on shoulders that move
-            R_arm = tuple(R_WL[f"{side}_{part}"] for part in ARM)
+            R_arm = [R_WL[f"{side}_{part}"] for part in ARM]
             along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
             shoulder_T = girdle.place(SIDES[side], self.moving_time(t)) + girdle.displace(along_T, SIDES[side])
-            place_arm(pose, side, origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
+            place_arm(pose, side, origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.flaws)
         if (root := self.root(t)) is not None:
             pose = pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
         return pose
@@ -333,52 +327,3 @@ class Sit(WholeBodyActivity):
 
 
 ACTIVITIES: dict[str, type[Activity]] = {each.phase: each for each in (Walk, Sit, ArmTasks, Run, Throw)}
-
-
-def simulate_activity(
-    activity: str,
-    *,
-    seed: Count,
-    rate_hz: Positive = 100.0,
-    noise: ImuNoise = MTI_3,
-    imperfections: Imperfections = IDEAL_PRESET,
-    seconds: Positive = 40.0,
-    lengths: Mapping[str, float] | None = None,
-) -> Simulation:
-    """Simulate an activity with known truth: of the whole body with a sensor on each of 15 segments, or of the arms.
-
-    0 to 5 s static in the N-pose, `seconds` of the activity, 2 s static.
-
-    Parameters
-    ----------
-    activity : "walk", "sit", "run", "throw" of the whole body, or "tasks" of the arms
-    seed, rate_hz, noise : as in `simulate`
-    imperfections : as in `simulate`. Activities of the whole body leave sway and wrists out; of soft tissue the legs
-        have the random part only, and what people hold in the start pose they hold throughout
-    seconds : [s] duration of the activity
-    lengths : of the body [m]; those not named, or None: a person of 1.75 m
-
-    Returns
-    -------
-    Simulation
-        As that of `simulate`.
-
-    Raises
-    ------
-    BadOption, BadModel
-        No such activity; too short for it; a length that the body does not have.
-
-    Examples
-    --------
-    >>> wp.simulate_activity("walk", seed=1, seconds=8.0)
-    Simulation(15.0 s at 100 Hz, 15 sensors)
-    """
-    check_arguments(simulate_activity, locals())
-    if activity not in ACTIVITIES:
-        raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
-    rngs = spawn_streams(seed)
-    model = load_model(ACTIVITIES[activity].body, lengths)
-    # Shoulders that do not move: those of people that do are placed by their own girdle, not by the one tracked with.
-    model = replace(model, girdles=dict.fromkeys(model.table.girdles, FIXED))
-    flaws = Flaws(imperfections, rngs, model.lengths)
-    return measure_motion(ACTIVITIES[activity](model, rngs["motion"], seconds, flaws), rngs, rate_hz, noise)

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Collection
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
 from ..rotations import compose, turn_about
-from .motion import E_Z, MARGIN_S, RAMP_S, SEGMENTS, STAND_S, BodyMotion, BodyPose, place_arm
-from .people import SIDES, Flaws
+from .motion import MARGIN_S, RAMP_S, SEGMENTS, STAND_S, BodyMotion, place_arm
+from .people import E_Z, SIDES, BodyPose, Flaws
 from .signals import Process, make_pulse, make_step
 
 END_S = 2.0  # after an activity the person stands still
@@ -27,22 +26,16 @@ _TYPING = np.deg2rad((0.0, 0.0, 1.0, 0.7, 1.5))  # [rad] rms of each angle of th
 _TYPING_CORRELATION_S = 0.05
 
 
-class _Kind(NamedTuple):
-    """A kind of posture of an arm: how often it is, mean and spread [deg] of its angles between postures."""
-
-    share: float
-    mean: tuple[float, float, float, float, float]  # elevation, plane, inward twist, elbow flexion, inward pronation
-    std: tuple[float, float, float, float, float]
-    typing: bool = False
-
-
+# Kinds of postures of an arm: how often each is; mean and spread [deg] of elevation, plane, inward twist, elbow flexion
+# and inward pronation between postures.
 _KINDS = (
-    _Kind(0.54, (28.0, 60.0, 20.0, 75.0, 20.0), (10.0, 30.0, 18.0, 20.0, 25.0)),  # work before the body
-    _Kind(0.12, (22.0, 65.0, 25.0, 85.0, 45.0), (6.0, 20.0, 8.0, 8.0, 8.0), typing=True),
-    _Kind(0.12, (78.0, 60.0, 0.0, 35.0, 10.0), (24.0, 30.0, 20.0, 15.0, 25.0)),  # reach far and high
-    _Kind(0.10, (45.0, 70.0, 10.0, 118.0, 0.0), (10.0, 15.0, 15.0, 8.0, 20.0)),  # hand to the face
-    _Kind(0.12, (10.0, 30.0, 5.0, 20.0, 5.0), (4.0, 40.0, 8.0, 8.0, 12.0)),  # hanging
+    (0.54, (28.0, 60.0, 20.0, 75.0, 20.0), (10.0, 30.0, 18.0, 20.0, 25.0)),  # work before the body
+    (0.12, (22.0, 65.0, 25.0, 85.0, 45.0), (6.0, 20.0, 8.0, 8.0, 8.0)),  # typing
+    (0.12, (78.0, 60.0, 0.0, 35.0, 10.0), (24.0, 30.0, 20.0, 15.0, 25.0)),  # reach far and high
+    (0.10, (45.0, 70.0, 10.0, 118.0, 0.0), (10.0, 15.0, 15.0, 8.0, 20.0)),  # hand to the face
+    (0.12, (10.0, 30.0, 5.0, 20.0, 5.0), (4.0, 40.0, 8.0, 8.0, 12.0)),  # hanging
 )
+_TYPING_KIND = 1
 _RANGE = np.deg2rad(((4.0, -30.0, -60.0, 8.0, -60.0), (130.0, 120.0, 70.0, 130.0, 70.0)))
 _SPEED = np.deg2rad(95.0)  # [rad/s] mean over a move, of the angle that turns most
 _SHORTEST_S = 0.4
@@ -54,13 +47,8 @@ _TRUNK_MEAN = np.deg2rad((0.0, 10.0, 0.0))
 _TRUNK_MOST = np.deg2rad((23.0, 59.0, 32.0))
 
 
-class _Move(NamedTuple):
-    """A move to a posture."""
-
-    posture: np.ndarray  # (k,)
-    duration: float  # [s]
-    hold: float  # [s] for which the posture is held
-    typing: bool = False  # meanwhile
+# A move: to which posture (k,), in what time [s], for how long it is held [s], and whether the hand types meanwhile.
+_Move = tuple[np.ndarray, float, float, bool]
 
 
 class _Path:
@@ -68,20 +56,20 @@ class _Path:
 
     def __init__(self, rest: np.ndarray, stop: float, draw: Callable[[np.ndarray], _Move]) -> None:
         """Go from `rest` (k,) and be back at `stop` [s]; `draw` draws the next move from a posture."""
-        postures, start, duration, at = [rest, rest], [0.0], [1.0], STAND_S
+        postures, start, durations, at = [rest, rest], [0.0], [1.0], STAND_S
         self.typing: list[tuple[float, float]] = []
         while True:
-            move = draw(postures[-1])
-            arrived = at + move.duration
-            if arrived + move.hold > stop - RAMP_S:
+            posture, duration, hold, types = draw(postures[-1])
+            arrived = at + duration
+            if arrived + hold > stop - RAMP_S:
                 break
-            postures.append(move.posture)
+            postures.append(posture)
             start.append(at)
-            duration.append(move.duration)
-            if move.typing:
-                self.typing.append((arrived, arrived + move.hold))
-            at += move.duration + move.hold
-        self._start, self._duration = np.array([*start, stop - RAMP_S]), np.array([*duration, RAMP_S])
+            durations.append(duration)
+            if types:
+                self.typing.append((arrived, arrived + hold))
+            at += duration + hold
+        self._start, self._duration = np.array([*start, stop - RAMP_S]), np.array([*durations, RAMP_S])
         moved = np.concatenate(([0.0, 0.0], np.cumsum(self._duration[1:])))
         self._values = np.column_stack((np.array([*postures, rest]), moved))
 
@@ -99,14 +87,14 @@ class Activity(BodyMotion):
     phase: str
     body: str  # the model's name
 
-    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
-        super().__init__(model.lengths, flaws)
+    def __init__(self, model: BodyModel, seconds: float, flaws: Flaws) -> None:
+        super().__init__(flaws)
         self.model, self.seconds, self.stop = model, seconds, STAND_S + seconds
         self.end = self.stop + END_S
         self.pulses = [(STAND_S, self.stop, RAMP_S)]
         self.phases[self.phase] = [(STAND_S + MARGIN_S, self.stop - MARGIN_S)]
         self.phases["rest"] = [(self.stop + MARGIN_S, self.end - MARGIN_S)]
-        self.prepare(rng)
+        self.prepare(flaws.rngs["motion"])
 
     @abstractmethod
     def prepare(self, rng: np.random.Generator) -> None:
@@ -132,24 +120,25 @@ class ArmTasks(Activity):
 
     @staticmethod
     def _draw_trunk(rng: np.random.Generator) -> _Move:
-        """Draw a move of the trunk's rotation vector (3,) [rad]."""
+        """Draw a move of the trunk, by its rotation vector (3,) [rad]."""
         posture = np.clip(_TRUNK_MEAN + _TRUNK_STD * rng.standard_normal(3), -_TRUNK_MOST, _TRUNK_MOST)
-        return _Move(posture, rng.uniform(1.0, 2.5), rng.exponential(3.0))
+        return posture, rng.uniform(1.0, 2.5), rng.exponential(3.0), False
 
     def _draw_arm(self, rng: np.random.Generator, side: str) -> _Path:
         """Draw the path of an arm: elevation about x and y of the torso, twist, elbow flexion, pronation [rad]."""
         y, pose = SIDES[side], self.flaws.start_pose
 
         def draw(before: np.ndarray) -> _Move:
-            kind = _KINDS[rng.choice(len(_KINDS), p=[kind.share for kind in _KINDS])]
-            drawn = np.deg2rad(np.array(kind.mean) + np.array(kind.std) * rng.standard_normal(5))
+            kind = rng.choice(len(_KINDS), p=[share for share, _, _ in _KINDS])
+            _, mean, std = _KINDS[kind]
+            drawn = np.deg2rad(np.array(mean) + np.array(std) * rng.standard_normal(5))
             elevation, plane, twist, flexion, pronation = np.clip(drawn, *_RANGE)
             swing = elevation * np.array((y * np.cos(plane), -np.sin(plane)))
             posture = np.array((*swing, -y * twist, flexion, -y * pronation))
             duration = max(_SHORTEST_S, np.abs(posture - before).max() / _SPEED * rng.uniform(0.7, 1.5))
             hold, rest = rng.exponential(_PAUSE_S), rng.exponential(_REST_S)
-            rests, types = rng.uniform() < _REST_SHARE, rng.uniform(*_TYPING_S)
-            return _Move(posture, duration, types if kind.typing else rest if rests else hold, kind.typing)
+            hold, typing_s = rest if rng.uniform() < _REST_SHARE else hold, rng.uniform(*_TYPING_S)
+            return (posture, duration, typing_s, True) if kind == _TYPING_KIND else (posture, duration, hold, False)
 
         return _Path(np.array((*pose.upper_arm[side], pose.flexion[side], pose.pronation[side])), self.stop, draw)
 
@@ -178,5 +167,5 @@ class ArmTasks(Activity):
             R_FH = flaws.wrists.rotate(y, t, self.activity(t), np.zeros_like(t), self._distance(t, side))
             shoulder_T = flaws.girdle.place(y, self.moving_time(t, f"{side}_upper_arm"))
             shoulder_T = shoulder_T + flaws.girdle.displace(R_TU.apply(-E_Z), y)
-            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, R_FH)), self.lengths)
+            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, R_FH)), flaws)
         return pose

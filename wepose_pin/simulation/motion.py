@@ -1,40 +1,38 @@
-"""The motion of protocols: a closed form of continuous time.
+"""The motion of protocols: a closed form of continuous time, exact between the samples as well.
 
-It is exact between the samples as well, and shares no code with the model room, since tests compare the two. The torso
-frame T has the origin of W: the torso rotates about it.
+It shares no code with the body room, since tests compare the two. The torso frame T has the origin of W: the torso
+rotates about it.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import BadOption, one_of
+from ..errors import BadOption
 from ..rotations import compose, log, turn_about
-from .imperfections import IDEAL_PRESET, Imperfections
-from .people import SIDES, Flaws, Offset, place_shoulder
+from .people import E_Z, SIDES, BodyPose, Flaws, Offset, place_shoulder
 from .signals import Wander, integrate_pulse, make_pulse, make_step
 
 CIRCLING_POINT = "right_palm"  # draws the circles after the protocol
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 ARM = ("upper_arm", "forearm", "hand")
 
-E_Z = np.array((0.0, 0.0, 1.0))
 STAND_S = 5.0  # N-pose at the start
 _LEAD_S = 2.5  # N-pose to clasp, clasp to table
 RAMP_S = 2.0  # a motion grows and dies away over this time
 _REST_S = (2.5, 2.0)  # first rest on the table, each later one
 _LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
+_LEAN_DEG = 15.0  # yaw, pitch, roll of the torso in the clasp
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
-_LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
-_PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move: below, the rounds would not settle
+# Flexion at which a hand is out of reach, and the same while rounds are chosen: below, they would not settle.
+_LEAST_FLEXION, _STRICT_FLEXION = np.deg2rad((3.0, 15.0))
 # Tried in turn: rounds in which an arm's reach is solved, and the distance [m] by which the hands stay nearer than the
 # arms are long.
 _REACHES = [
@@ -62,22 +60,14 @@ T_POSE = {
 }
 
 
-class BodyPose(NamedTuple):
-    """Exact motion at n times."""
-
-    R_WL: dict[str, Rotation]  # segment -> n rotations
-    points: dict[str, np.ndarray]  # point -> (n, 3) [m] in W
-    origins: dict[str, np.ndarray]  # segment -> (n, 3) [m] in W, or (3,) where it does not move
-
-
 class BodyMotion(ABC):
     """A body's motion as a function of continuous time, after standing in the N-pose."""
 
     end: float  # [s] of the recording
 
-    def __init__(self, lengths: Mapping[str, float], flaws: Flaws) -> None:
-        self.lengths, self.flaws = lengths, flaws
-        self.p_LS = place_sensors(lengths, flaws.sizes)  # segment → (3,) [m] in L
+    def __init__(self, flaws: Flaws) -> None:
+        self.lengths, self.flaws = flaws.lengths, flaws
+        self.p_LS = place_sensors(flaws)  # segment → (3,) [m] in L
         self.pulses: list[tuple[float, float, float]] = []  # begin, end and ramp [s] of each time of motion
         self.phases: dict[str, list[tuple[float, float]]] = {"start": [(0.5, STAND_S - 0.5)]}
 
@@ -94,8 +84,7 @@ class BodyMotion(ABC):
         return sum((integrate_pulse(t, *pulse) for pulse in self.pulses), np.zeros_like(t))
 
 
-@dataclass(frozen=True)
-class _Circle:
+class _Circle(NamedTuple):
     """One circle of the right hand, drawn between two rests on the table."""
 
     start: float  # [s] lift off the table
@@ -147,20 +136,12 @@ class _Hand(NamedTuple):
 class Motion(BodyMotion):
     """Torso and arms in the motions of protocols, one after the other, then circles of the right hand."""
 
-    lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
     closes = True  # palms must reach each other to some micrometres
 
-    def __init__(
-        self,
-        lengths: Mapping[str, float],
-        rng: np.random.Generator,
-        parts: Sequence[str],
-        clasp_s: float,
-        circles: int,
-        flaws: Flaws,
-    ) -> None:
-        super().__init__(lengths, flaws)
-        self.least_flexion, self.most_missing, self.rounds = _LEAST_FLEXION, np.inf, 1
+    def __init__(self, flaws: Flaws, parts: Sequence[str], clasp_s: float, circles: int) -> None:
+        super().__init__(flaws)
+        lengths, rng = flaws.lengths, flaws.rngs["motion"]
+        self.strict, self.rounds = False, 1  # whether hands must reach with some flexion, and to some micrometres
         self.slack = max(0.012, flaws.sizes.palm_slip) if flaws.sizes.palm_slip else 0.0  # arms need it for the slip
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
@@ -198,28 +179,31 @@ class Motion(BodyMotion):
         gate = make_pulse(grid, *self.clasp, RAMP_S)
         rms = np.array([np.sqrt(np.mean((gate * wander(grid)) ** 2)) for wander in flaws.slip])
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
+        self.prepare(flaws.rngs["task"])
+        if flaws.iterates:
+            self._fit_reach()
 
     def prepare(self, rng: np.random.Generator) -> None:
         """Draw how this person does the parts."""
         size = self.flaws.sizes.start_pose
-        self.pose = {}
-        for side in SIDES:
+        self.raised, self.bent = dict[str, np.ndarray](), dict[str, np.ndarray]()  # rotation of an arm, of its forearm
+        for side, y in SIDES.items():
             rng.standard_normal(9), rng.uniform(size=5)  # of parts that there were: a seed keeps its person
-            self.pose[side] = {
-                name: np.deg2rad(offset.mean + size * offset.std * np.clip(rng.standard_normal(), -2.3, 2.3))
-                for name, offset in T_POSE.items()
-            }
+            elevation, plane, *bent = (
+                np.deg2rad(offset.mean + size * offset.std * np.clip(rng.standard_normal(), -2.3, 2.3))
+                for offset in T_POSE.values()
+            )
+            raised = Rotation.from_euler("x", y * (0.5 * np.pi + elevation))
+            self.raised[side] = (Rotation.from_euler("z", -y * plane) * raised).as_rotvec()
+            self.bent[side] = np.array(bent)
         self.bow_axis = size * BOW_AXIS_STD * np.clip(rng.standard_normal(), -2.3, 2.3)
 
-    def fit_to_person(self, rng: np.random.Generator) -> None:
-        """Prepare the motion; where shoulders and wrists move, hands stay as near as the arms then need."""
-        self.prepare(rng)
-        if not self.flaws.iterates:
-            return
+    def _fit_reach(self) -> None:
+        """Keep the hands as near as the arms need where shoulders and wrists move."""
         grid, clasp_t = np.arange(self.clasp[0], self.end, 0.05), np.arange(*self.clasp, 0.05)
         moving = self._motion_share(clasp_t)
         reaches = _REACHES if self.closes else [(1, self.slack)]
-        self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
+        self.strict = True
         for self.rounds, self.slack in reaches:
             distance = np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1)
             self.flaws.wrists.fit(clasp_t, moving, np.column_stack((distance, distance)))
@@ -230,7 +214,7 @@ class Motion(BodyMotion):
             except BadOption:
                 if (self.rounds, self.slack) == reaches[-1]:
                     raise
-        self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
+        self.strict = False
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
         """Return the point where the palms meet (n, 3) [m] in T, from midway between the shoulders, in reach."""
@@ -279,7 +263,7 @@ class Motion(BodyMotion):
         upper, lower = self.arm[side]
         distance = np.linalg.norm(palm_T, axis=1)
         cos_flexion = (distance**2 - upper**2 - lower**2) / (2.0 * upper * lower)
-        if not np.all(np.abs(cos_flexion) < np.cos(self.least_flexion)):
+        if not np.all(np.abs(cos_flexion) < np.cos(_STRICT_FLEXION if self.strict else _LEAST_FLEXION)):
             raise BadOption(f"lengths: the {side} arm ({upper:.3f} + {lower:.3f} m) does not reach through the motion")
         flexion = np.arccos(cos_flexion)
         cos_alpha = (upper + lower * cos_flexion) / distance  # between upper arm and line to the palm
@@ -328,7 +312,7 @@ class Motion(BodyMotion):
             shoulder_T = shoulder_T + _RELAXATION * (centre_T + flaws.girdle.displace(along_T, y) - shoulder_T)
         missing = np.linalg.norm(hand.palm_T - shoulder_T - R_TU.apply(palm_U), axis=1)
         worst = float(np.max(missing * (hand.lead == 1.0), initial=0.0))
-        if worst > self.most_missing:
+        if self.strict and worst > _MOST_MISSING:
             raise BadOption(f"lengths: the {side} arm does not reach through the motion, by {1e3 * worst:.2g} mm")
         return shoulder_T, R_TU, flexion
 
@@ -339,7 +323,7 @@ class Motion(BodyMotion):
         table = make_step(t, self.clasp[1], _LEAD_S)  # from the clasp to the table
 
         lean = np.column_stack([self.wander[name](t) for name in ("yaw", "pitch", "roll")])
-        lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
+        lean *= np.deg2rad(_LEAN_DEG * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         lean[:, 1:] += flaws.sway_torso(t)
         R_WT = turn_about("ZYX", lean)
         for part in (part for part in self.schedule if part.kind == "bow"):
@@ -382,7 +366,7 @@ class Motion(BodyMotion):
             elbow += lead[:, None] * np.column_stack((flexion, hand.pronation))
             R_WU = compose(R_WT, _scale(R_TU, lead), hang)
             R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, *elbow.T))
-            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, hand_F)), self.lengths)
+            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, hand_F)), flaws)
         return pose
 
     def _hold_poses(self, t: np.ndarray, side: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -393,24 +377,11 @@ class Motion(BodyMotion):
         """
         turn, bend, start = np.zeros((len(t), 3)), np.zeros((len(t), 2)), np.ones_like(t)
         for part in (part for part in self.schedule if part.kind == "t_pose"):
-            held, pose = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S), self.pose[side]
-            raised = Rotation.from_euler("x", SIDES[side] * (0.5 * np.pi + pose["elevation"]))
-            raised = Rotation.from_euler("z", -SIDES[side] * pose["plane"]) * raised
-            turn += held[:, None] * raised.as_rotvec()
-            bend += held[:, None] * np.array((pose["elbow"], pose["forearm_twist"]))
+            held = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S)
+            turn += held[:, None] * self.raised[side]
+            bend += held[:, None] * self.bent[side]
             start = start * (1.0 - held)
         return turn, bend, start
-
-
-TASKS: dict[str, type[Motion]] = dict.fromkeys(PARTS, Motion)  # protocol, by itself -> its motion
-
-
-def find_task(protocol: str) -> type[Motion]:
-    """Find the motion of a protocol, or of several that are joined by "+"; `BadOption`: there is none."""
-    parts = protocol.split("+")
-    if protocol not in TASKS and (not set(parts) <= set(PARTS) or len(set(parts)) < len(parts)):
-        raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(TASKS, protocol)}; or several joined by +")
-    return TASKS.get(protocol, Motion)
 
 
 def _schedule(parts: Sequence[str], begin: float, end: float) -> list[_Part]:
@@ -451,26 +422,21 @@ def _scale(R: Rotation, share: np.ndarray) -> Rotation:
     return Rotation.from_rotvec(share[:, None] * log(R.as_quat()))
 
 
-def place_arm(
-    pose: BodyPose,
-    side: str,
-    shoulder_W: np.ndarray,
-    R_WL: tuple[Rotation, Rotation, Rotation],
-    lengths: Mapping[str, float],
-) -> None:
+def place_arm(pose: BodyPose, side: str, shoulder_W: np.ndarray, R_WL: Sequence[Rotation], flaws: Flaws) -> None:
     """Put an arm into a pose, by its shoulder (n, 3) [m] in W and the rotations of upper arm, forearm and hand."""
     p_W = shoulder_W
     for part, start, R in zip(ARM, ("shoulder", "elbow", "wrist"), R_WL, strict=True):
         pose.R_WL[f"{side}_{part}"] = R
         pose.origins[f"{side}_{part}"] = pose.points[f"{side}_{start}"] = p_W
-        p_W = p_W + R.apply((0.0, 0.0, -lengths[f"{side}_{part}"]))
+        p_W = p_W + R.apply((0.0, 0.0, -flaws.lengths[f"{side}_{part}"]))
     pose.points[f"{side}_palm"] = p_W
 
 
-def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRESET) -> dict[str, np.ndarray]:
+def place_sensors(flaws: Flaws) -> dict[str, np.ndarray]:
     """Place each sensor in L [m]: on the sternum, and on the outer side of the arm segments."""
+    lengths = flaws.lengths
     places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
-    upper_arm, forearm = 0.5 + sizes.sensor_place * np.array((0.1, 0.35))
+    upper_arm, forearm = 0.5 + flaws.sizes.sensor_place * np.array((0.1, 0.35))
     for side, y in SIDES.items():
         places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -upper_arm * lengths[f"{side}_upper_arm"]))
         places[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -forearm * lengths[f"{side}_forearm"]))

@@ -1,4 +1,4 @@
-"""How people differ from the model: shoulders, elbows and wrists that move otherwise, poses as they hold them."""
+"""How people differ from the model: shoulders, elbows, wrists, poses as they hold them, tissue under sensors."""
 
 from __future__ import annotations
 
@@ -8,11 +8,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..rotations import turn_about
-from .imperfections import Imperfections
-from .signals import Process, Sway, Wander, rotate_about
+from ..rotations import compose, log, turn_about
+from .imperfections import GRAVITY, Imperfections
+from .signals import Process, RandomWalk, Streams, Sway, Wander, integrate_step, rotate_about
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
+E_Z = np.array((0.0, 0.0, 1.0))
+
+
+class BodyPose(NamedTuple):
+    """Exact motion at n times."""
+
+    R_WL: dict[str, Rotation]  # segment -> n rotations
+    points: dict[str, np.ndarray]  # point -> (n, 3) [m] in W
+    origins: dict[str, np.ndarray]  # segment -> (n, 3) [m] in W, or (3,) where it does not move
 
 
 class Offset(NamedTuple):
@@ -24,13 +33,7 @@ class Offset(NamedTuple):
 
 # The N-pose on request, each person's own: assumptions, held to the drop from acromion to wrist of ANSUR II (Gordon
 # 2014; a straight arm would be tilted by 10 to 12 deg), to N-pose errors in Bouvier 2015 and Bonfiglio 2024a.
-TRUNK_POSE = {
-    "torso_pitch": Offset(0.0, 3.0),
-    "torso_roll": Offset(0.0, 1.5),
-    "head_pitch": Offset(0.0, 5.0),
-    "head_roll": Offset(0.0, 2.0),
-    "head_heading": Offset(0.0, 5.0),
-}
+_TRUNK_POSE_STD = np.deg2rad((3.0, 1.5, 5.0, 2.0, 5.0))  # pitch, roll of the torso; pitch, roll, heading of the head
 ARM_POSE = {
     "upper_arm_outwards": Offset(8.0, 4.0),
     "upper_arm_forwards": Offset(0.0, 5.0),
@@ -43,7 +46,7 @@ _SWAY_DEG_S, _TILT_DEG = 0.5, 0.22  # rms, fast and slow part of the sway
 _TILT_S = 1.5  # correlation time of the slow part, assumption
 
 # Carrying angle, extended and supinated: Van Roy 2005, Ergonomics 48, 1645; in neutral pronation: as in ARM_POSE.
-_CARRYING = {"m": Offset(11.6, 3.2), "f": Offset(16.7, 2.6)}
+_CARRYING = (Offset(16.7, 2.6), Offset(11.6, 3.2))  # of women, of men
 _NEUTRAL_CARRYING = Offset(5.0, 3.0)
 _SUPINATION_DEG = 80.0  # full; Zwerus 2019, Shoulder Elbow 11, 215
 _ABDUCTION_DEG = 1.5  # rms
@@ -66,21 +69,58 @@ _AC_TO_GH = np.array((0.008, -0.036, 0.003))  # [m] at rest, outer end of the cl
 _AC_TO_GH_SCAPULA = Rotation.from_euler("YZX", _SCAPULA[:, 4], degrees=True).inv().apply(_AC_TO_GH)
 _ONSET_DEG = 15.0  # the regression holds from about 30 deg of elevation: below, its angles grow from those at rest
 _PLANE_BLUR = np.sin(np.deg2rad(8.0))  # the plane of a hanging arm has no meaning: it is blurred there
-_ROUND = np.deg2rad(3.0)
 _PERSON = np.array((0.006, 0.005, 0.008))  # [m] x, y, z in T, at 90 deg: Matsuki 2011-14, Henninger 2020
 _WANDER = np.array((0.007, 0.004, 0.008))  # [m] rms, assumption: 3 to 4 deg of girdle
 _WANDER_S = 3.0  # its correlation time
 _REST = np.array((0.018, 0.012, 0.013))  # [m] between people
 _REST_CORRELATION = 0.7  # between left and right, assumption
 
+# Rotation of a sensor on its segment, degree per degree of a joint's, and its spread between people and strappings.
+GAINS = {
+    # A bow turns the sternum more than the trunk, assumption.
+    "torso_flexion": Offset(0.12, 0.05),
+    # The chest extends by 12.8 (7.6) deg when both arms go up: Edmondston 2012, J Orthop Sports Phys Ther 42, 861.
+    "torso_elevation": Offset(-0.04, 0.025),
+    # One arm up bends and turns the chest to either side: Stewart 1995, J Man Manip Ther 3, 15.
+    "torso_sides": Offset(0.0, 0.02),
+    "upper_arm_elevation": Offset(-0.05, 0.04),  # Hamming 2012 J Biomech; Jackson 2015 Appl Ergon 47, 242
+    "upper_arm_flexion": Offset(0.02, 0.02),  # biceps and triceps bulge, either sign, assumption
+    "forearm_flexion": Offset(0.01, 0.01),  # assumption, either sign
+    "pelvis_flexion": Offset(-0.08, 0.04),  # assumption
+}
+_TWIST_STD = 0.08  # of the two gains of twist, between people
+# rms across and about the segment's long axis [deg], correlation time [s]; assumptions, held to Lebel 2017.
+RANDOM_DEG = {
+    "torso": (1.5, 1.5, 3.0),
+    "upper_arm": (2.0, 2.5, 2.0),
+    "forearm": (2.0, 2.0, 2.0),
+    "hand": (1.5, 1.5, 1.0),
+    "pelvis": (2.0, 1.5, 3.0),
+    "head": (1.0, 1.0, 5.0),
+}
+_ELEVATED = np.deg2rad((20.0, 20.0))  # elevation is read too small from 30 deg on: this far below, and so softly
+_BREATH_DEG, _BREATH_HZ = 0.7, (0.22, 0.28)
+_CREEP_DEG, _CREEP_S = 1.0, 600.0
+_WOBBLE_DEG = 0.5  # per g
+
+# Streams of random numbers; "-" are those of what there was: a seed keeps its person.
+_STREAMS = (
+    "motion strap noise palm_slip - - - sway - device clock_jitter clock_offset dropped mount task tissue_gain "
+    "tissue_random breath creep - girdle_person girdle_wander girdle_rest carrying_angle elbow_abduction start_pose "
+    "start_heading sway_tilt wrist gyro_warm_up clock_drift"
+).split()
+
 
 class Flaws:
-    """Random imperfections of one person's motion; the sizes scale draws that do not depend on them."""
+    """Random imperfections of one person's motion; the sizes scale draws that do not depend on them.
 
-    def __init__(
-        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], lengths: Mapping[str, float]
-    ) -> None:
-        self.sizes = sizes
+    `rngs` are the person's streams of random numbers, `lengths` those of the body [m].
+    """
+
+    def __init__(self, sizes: Imperfections, seed: int, lengths: Mapping[str, float]) -> None:
+        self.sizes, self.lengths = sizes, lengths
+        rngs = dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
+        self.rngs: Streams = rngs
         self.girdle = SimulatedGirdle(sizes, rngs, lengths)
         self.elbow_joint = Elbow(sizes, rngs)
         self.wrists = Wrists(sizes, rngs)
@@ -107,19 +147,18 @@ class Flaws:
 class StartPoseOffsets:
     """One person's offsets from the start pose: rotation vectors [rad] of torso and upper arms, angles of elbows."""
 
-    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
-        z = rngs["start_pose"].standard_normal(len(TRUNK_POSE))
-        trunk = sizes.start_pose * np.deg2rad([offset.std for offset in TRUNK_POSE.values()]) * z
-        heading = np.deg2rad(sizes.start_heading_deg) * rngs["start_heading"].standard_normal()
-        self.torso = np.array((trunk[1], trunk[0], heading))
+    def __init__(self, sizes: Imperfections, rngs: Streams) -> None:
+        rng, heading = rngs["start_pose"], rngs["start_heading"].standard_normal()
+        trunk = sizes.start_pose * _TRUNK_POSE_STD * rng.standard_normal(len(_TRUNK_POSE_STD))
+        self.torso = np.array((trunk[1], trunk[0], np.deg2rad(sizes.start_heading_deg) * heading))
         self.head = trunk[[3, 2, 4]]
         self.upper_arm: dict[str, np.ndarray] = {}
         self.flexion: dict[str, float] = {}
         self.pronation: dict[str, float] = {}  # about z of the forearm
         mean, std = np.deg2rad(list(ARM_POSE.values())).T
-        both = rngs["start_pose"].standard_normal((3, len(ARM_POSE)))
-        for (side, y), own in zip(SIDES.items(), both[1:], strict=True):
-            z = np.sqrt(_SIDES_CORRELATION) * both[0] + np.sqrt(1.0 - _SIDES_CORRELATION) * own
+        common, *both = rng.standard_normal((3, len(ARM_POSE)))
+        for (side, y), own in zip(SIDES.items(), both, strict=True):
+            z = np.sqrt(_SIDES_CORRELATION) * common + np.sqrt(1.0 - _SIDES_CORRELATION) * own
             outwards, forwards, twist, flexion, inwards = sizes.start_pose * (mean + std * np.clip(z, -2.3, 2.3))
             self.upper_arm[side] = np.array((y * outwards, -forwards, -y * twist))
             self.flexion[side] = flexion
@@ -134,19 +173,18 @@ class Elbow:
     neutral forearm, and as far again.
     """
 
-    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
+    def __init__(self, sizes: Imperfections, rngs: Streams) -> None:
         rng = rngs["carrying_angle"]
-        sex = ("f", "m")[int(rng.integers(2))]
         supinated, neutral = (
             offset.mean + offset.std * np.clip(rng.standard_normal(), -2.5, 2.5)
-            for offset in (_CARRYING[sex], _NEUTRAL_CARRYING)
+            for offset in (_CARRYING[int(rng.integers(2))], _NEUTRAL_CARRYING)
         )
         self.carrying, self.neutral = sizes.elbow * np.deg2rad((supinated, neutral))
         self.abduction = sizes.elbow * np.deg2rad(_ABDUCTION_DEG) * np.sqrt(2.0)
         self.phase = rngs["elbow_abduction"].uniform(0.0, 2.0 * np.pi)
 
     def _angles(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> np.ndarray:
-        """Angles (n, 4) [rad] about x, y, x, z, one after the other, of the side y."""
+        """Return angles (n, 4) [rad] about x, y, x, z, one after the other, of the side y."""
         inwards = (self.carrying - self.neutral) * (1.0 - y * pronation / np.deg2rad(_SUPINATION_DEG))
         varying = self.abduction * np.sin(2.0 * np.pi * flexion / np.deg2rad(_ABDUCTION_PERIOD_DEG) + self.phase)
         half = 0.5 * self.carrying
@@ -154,11 +192,11 @@ class Elbow:
         return np.column_stack((humerus, -flexion, y * (half - inwards + varying), pronation))
 
     def rotate(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> Rotation:
-        """R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
+        """Return R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
         return turn_about("XYXZ", self._angles(y, flexion, pronation))
 
     def rotate_vectors(self, y: float, flexion: np.ndarray, pronation: np.ndarray, vectors_F: np.ndarray) -> np.ndarray:
-        """Vectors (n, 3) in the upper arm from those in the forearm: `rotate`, made for speed."""
+        """Return vectors (n, 3) in the upper arm from those in the forearm: `rotate`, made for speed."""
         x, flex, abduct, pronate = self._angles(y, flexion, pronation).T
         vectors = rotate_about(0, abduct, rotate_about(2, pronate, vectors_F))
         return rotate_about(0, x, rotate_about(1, flex, vectors))
@@ -167,7 +205,7 @@ class Elbow:
 class Wrists:
     """One person's wrists, which bend as the hands come near the chest, and wander; hands have no sensor."""
 
-    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator]) -> None:
+    def __init__(self, sizes: Imperfections, rngs: Streams) -> None:
         self.rms = sizes.wrists * np.deg2rad(_WRIST_DEG)
         # Hands near the chest extend the wrists; a deviation goes either way.
         self.sign = np.array((-1.0, rngs["wrist"].choice((-1.0, 1.0))))
@@ -186,22 +224,24 @@ class Wrists:
 
         `moving` (n,) is the share of the motion, `distance` (n, 2) [m] that of each hand from the chest.
         """
-        if not moving.any():
-            return
-        self.mean, self.std = float(np.mean(distance)), max(float(np.std(distance)), 0.01)
-        for side in range(2):
-            angles = moving[:, None] * sum(self._parts(t, distance[:, side], side))
-            self.gain[side] = 1.0 / np.sqrt(np.mean(angles**2, axis=0))
+        if moving.any():
+            self.mean, self.std = float(np.mean(distance)), max(float(np.std(distance)), 0.01)
+            for side in range(2):
+                angles = moving[:, None] * sum(self._parts(t, distance[:, side], side))
+                self.gain[side] = 1.0 / np.sqrt(np.mean(angles**2, axis=0))
 
     def rotate(
         self, y: float, t: np.ndarray, moving: np.ndarray, circling: np.ndarray, distance: np.ndarray
     ) -> Rotation:
-        """R_FH of the side y, its hand at that distance (n,); both parts in the clasp, the wandering in the circles."""
+        """Return R_FH of the side y; both parts of the angles in the clasp, the wandering in the circles."""
         side = 0 if y > 0.0 else 1
         follows, wanders = self._parts(t, distance, side)
         angles = moving[:, None] * (follows + wanders) + circling[:, None] * wanders
         flexion, deviation = (self.rms * self.gain[side] * angles).T
         return turn_about("YX", np.column_stack((-flexion, y * deviation)))
+
+
+# Shoulders ------------------------------------------------------------------------------------------------------------
 
 
 def compute_girdle(along_T: np.ndarray, side: float) -> np.ndarray:
@@ -217,19 +257,18 @@ def compute_girdle(along_T: np.ndarray, side: float) -> np.ndarray:
     plane = 45.0 + np.rad2deg(2.0 * np.arctan2(b, a + np.sqrt(horizontal**2 + _PLANE_BLUR**2)))
     onset = 1.0 - np.exp(-((elevation / _ONSET_DEG) ** 2))
 
-    def locate(clavicle: np.ndarray, scapula: np.ndarray) -> np.ndarray:
-        """Place (n, 3) [m] of the shoulder's centre by the angles (k, n) [deg] of clavicle and scapula."""
-        clavicle, scapula = np.deg2rad(clavicle), np.deg2rad(scapula)
+    def locate(clavicle_deg: np.ndarray, scapula_deg: np.ndarray) -> np.ndarray:
+        """Return the place (n, 3) [m] of the shoulder's centre by angles (k, n) of clavicle and scapula."""
+        clavicle, scapula = np.deg2rad(clavicle_deg), np.deg2rad(scapula_deg)
         outer_end = rotate_about(1, clavicle[0], rotate_about(2, clavicle[1], np.array((_CLAVICLE_LENGTH, 0.0, 0.0))))
         about_x = rotate_about(0, scapula[2], _AC_TO_GH_SCAPULA)
         return outer_end + rotate_about(1, scapula[0], rotate_about(2, scapula[1], about_x))
 
-    def angles(rows: np.ndarray) -> np.ndarray:
-        """Angles (k, n) [deg]."""
+    def angles_deg(rows: np.ndarray) -> np.ndarray:
         constant, by_plane, by_elevation, by_rest, rest = (column[:, None] for column in rows.T)
         return rest + onset * (constant + by_plane * plane + by_elevation * elevation + (by_rest - 1.0) * rest)
 
-    moved = locate(angles(_CLAVICLE), angles(_SCAPULA)) - locate(_CLAVICLE[:, 4:], _SCAPULA[:, 4:])
+    moved = locate(angles_deg(_CLAVICLE), angles_deg(_SCAPULA)) - locate(_CLAVICLE[:, 4:], _SCAPULA[:, 4:])
     return np.column_stack((-moved[:, 2], side * moved[:, 0], moved[:, 1]))
 
 
@@ -241,11 +280,8 @@ class SimulatedGirdle:
     left-right difference in z and a common shift in y.
     """
 
-    def __init__(
-        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], lengths: Mapping[str, float]
-    ) -> None:
+    def __init__(self, sizes: Imperfections, rngs: Streams, lengths: Mapping[str, float]) -> None:
         self.size, self.lengths = sizes.girdle, lengths
-        self.scale = lengths["shoulder_width"] / _WIDTH
         draws = np.clip(rngs["girdle_person"].standard_normal((2, 3)), -2.5, 2.5)
         self.wander = Process(rngs["girdle_wander"], _WANDER_S, 6)
         common, left, right = np.clip(rngs["girdle_rest"].standard_normal((3, 3)), -2.5, 2.5)
@@ -253,25 +289,136 @@ class SimulatedGirdle:
         rest = _REST * np.array(both)  # y is outwards here
         shift, tilt = 0.5 * (rest[0] - rest[1])[1:]
         rest[:, 1], rest[:, 2] = shift, (tilt, -tilt)
-        self.rest = {1.0: rest[0], -1.0: rest[1]}  # y of the side -> (3,) [m] in T
-        self.person = {1.0: draws[0], -1.0: draws[1]}
+        self.rest = dict(zip(SIDES.values(), rest, strict=True))  # y of the side -> (3,) [m] in T
+        self.person = dict(zip(SIDES.values(), draws, strict=True))
 
     def displace(self, along_T: np.ndarray, side: float) -> np.ndarray:
-        """Displacement (n, 3) [m] in T of the shoulder of the side y by its arm, along `along_T` (n, 3)."""
-        law = self.scale * compute_girdle(along_T, side)
-        horizontal = np.hypot(along_T[:, 0], along_T[:, 1])
-        # An angle from hanging has a kink there: rounded off within a few degrees.
-        elevation = np.hypot(np.arctan2(horizontal, -along_T[:, 2]), _ROUND) - _ROUND
+        """Return the displacement (n, 3) [m] in T of the shoulder of the side y by its arm, along `along_T` (n, 3)."""
+        law = self.lengths["shoulder_width"] / _WIDTH * compute_girdle(along_T, side)
+        elevation = _round_off(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2]))
         share = elevation / (0.5 * np.pi)
         return np.asarray(self.size * (law + share[:, None] * _PERSON * self.person[side]))
 
     def place(self, side: float, moving_time: np.ndarray) -> np.ndarray:
-        """Place (n, 3) [m] in T of a shoulder whatever its arm does, after that time of motion (n,) [s]."""
+        """Return the place (n, 3) [m] in T of a shoulder whatever its arm does, after that time of motion (n,) [s]."""
         own = slice(0, 3) if side > 0.0 else slice(3, 6)
         moved = self.size * (self.rest[side] + _WANDER * self.wander(moving_time, own))
         return np.asarray(place_shoulder(side, self.lengths) + moved)
 
 
 def place_shoulder(side: float, lengths: Mapping[str, float]) -> np.ndarray:
-    """Place the centre (3,) [m] of the shoulder of the side y in the torso, by the lengths."""
+    """Return the centre (3,) [m] of the shoulder of the side y in the torso, by the lengths."""
     return np.array((0.0, 0.5 * side * lengths["shoulder_width"], lengths["trunk"]))
+
+
+def _round_off(angle: np.ndarray) -> np.ndarray:
+    """Round off the kink that an angle from hanging (n,) [rad] has at zero, within a few degrees."""
+    soft = np.deg2rad(3.0)
+    return np.asarray(np.hypot(angle, soft) - soft)
+
+
+# Soft tissue ----------------------------------------------------------------------------------------------------------
+
+
+class _ArmRotations(NamedTuple):
+    """What the joints of an arm do at n times [rad]."""
+
+    elevation: np.ndarray  # (n,) of the upper arm in T
+    swing: np.ndarray  # (n, 3) rotation vector of the elevation, in the upper arm
+    twist: np.ndarray  # (n,) of the upper arm against the torso, about its long axis
+    flexion: np.ndarray  # (n,) of the elbow
+    pronation: np.ndarray  # (n,) of the forearm against the upper arm, about its long axis
+
+
+def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
+    """Split R into swing @ twist about z: the swing's rotation vector (n, 3) after the twist, the twist (n,) [rad]."""
+    z, w = R.as_quat()[:, 2:].T
+    twist = 2.0 * np.arctan2(np.where(w < 0.0, -z, z), np.abs(w))
+    about_z = Rotation.from_rotvec(twist[:, None] * E_Z)
+    return about_z.inv().apply(log(compose(R, about_z.inv()).as_quat())), twist
+
+
+def _read_arm(pose: BodyPose, side: str) -> _ArmRotations:
+    R_WU = pose.R_WL[f"{side}_upper_arm"]
+    swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
+    bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
+    elevation, flexion = (_round_off(np.linalg.norm(v, axis=1)) for v in (swing, bend))
+    return _ArmRotations(elevation, swing, twist, flexion, pronation)
+
+
+class SoftTissue:
+    """The rotation of one sensor on its segment: by the joints, at random, by breath, creep and acceleration.
+
+    `place` is the sensor's, as a share of the segment's length; `start` has trunk and arms in the start pose.
+    """
+
+    def __init__(
+        self, segment: str, place: float, sizes: Imperfections, rngs: Streams, duration: float, start: BodyPose
+    ) -> None:
+        side, _, part = segment.partition("_")
+        self.side, self.part = (side, part) if part else ("", segment)
+        self.sizes, self.start = sizes, start
+        self.draw = np.clip(rngs["tissue_gain"].standard_normal(4), -2.5, 2.5)
+        self.sign = rngs["tissue_gain"].choice((-1.0, 1.0), 2)
+        heading = rngs["tissue_gain"].uniform(0.0, 2.0 * np.pi)
+        self.across = np.array((np.cos(heading), np.sin(heading), 0.0))
+        # Share of the twist that the sensor does not follow. Upper arm: a line through the 35 to 48 % of Cutti 2005
+        # (Gait Posture 21, 341), the cluster gains of 0.64 to 0.74 of PubMed 40222145 and the ranges of Warner & Heller
+        # 2025. Forearm: an assumption, of which only the direction is known (Charles 2022, J Biomech Eng 144, 071007).
+        self.lost = 0.55 - 0.40 * place if self.part == "upper_arm" else 0.95 - 0.90 * place
+        across_deg, twist_deg, correlation_s = RANDOM_DEG.get(self.part, (0.0, 0.0, 1.0))
+        self.random_rms = np.deg2rad((across_deg, across_deg, twist_deg))
+        self.random = Process(rngs["tissue_random"], correlation_s, 3)
+        self.breath = 2.0 * np.pi * rngs["breath"].uniform(*_BREATH_HZ), rngs["breath"].uniform(0.0, 2.0 * np.pi)
+        self.creep = RandomWalk(rngs["creep"], duration, 3)
+        self.creep_rms = np.deg2rad(_CREEP_DEG) * np.sqrt(duration / _CREEP_S)
+
+    def _gain(self, name: str, k: int, sign: float = 1.0) -> float:
+        """Return this person's gain, with the draw k."""
+        return sign * (GAINS[name].mean + self.draw[k] * GAINS[name].std)
+
+    def follow(self, pose: BodyPose) -> np.ndarray:
+        """Return rotation vectors (n, 3) [rad] in L by the joints' rotation since the start pose, at people's size."""
+        turn = np.zeros((len(pose.R_WL["torso"]), 3))
+        if self.part in ("torso", "pelvis"):
+            flexion, first = (_split(each.R_WL["torso"])[0][:, 1] for each in (pose, self.start))
+            turn[:, 1] = self._gain(f"{self.part}_flexion", 0) * (flexion - first)
+        if self.part == "torso":
+            left, right = (_read_arm(pose, side).elevation - _read_arm(self.start, side).elevation for side in SIDES)
+            turn[:, 1] += self._gain("torso_elevation", 1) * 0.5 * (left + right)
+            turn[:, 0] = self._gain("torso_sides", 2) * (right - left)
+            turn[:, 2] = self._gain("torso_sides", 3) * (right - left)
+        elif self.part in ("upper_arm", "forearm"):
+            arm, first_arm = _read_arm(pose, self.side), _read_arm(self.start, self.side)
+            bend = arm.flexion - first_arm.flexion
+            twist = arm.twist - first_arm.twist if self.part == "upper_arm" else arm.pronation - first_arm.pronation
+            turn[:, 2] = -(self.lost + self.draw[0] * _TWIST_STD) * twist
+            if self.part == "upper_arm":
+                # The angle above 30 deg, about the axis of elevation; none below 20 deg, where it has no meaning.
+                angle = np.linalg.norm(arm.swing, axis=1)
+                above = integrate_step(angle, *_ELEVATED) / np.maximum(angle, _ELEVATED[0])
+                turn += self._gain("upper_arm_elevation", 1) * above[:, None] * arm.swing
+                turn += self._gain("upper_arm_flexion", 2, self.sign[0]) * bend[:, None] * self.across
+                turn[:, 2] += self._gain("upper_arm_flexion", 3, self.sign[1]) * bend
+            else:
+                turn += self._gain("forearm_flexion", 1, self.sign[0]) * bend[:, None] * self.across
+        return turn
+
+    def __call__(self, t: np.ndarray, moving_time: np.ndarray, pose: BodyPose, accel_L: np.ndarray) -> np.ndarray:
+        """Return rotation vectors (n, 3) [rad] in L at the times `t` (n,) [s].
+
+        The random part stands where the segment does: `moving_time` (n,) [s] is how long it has moved. `pose` at `t` is
+        of the torso and what carries the sensor, of the torso's sensor of both arms. Limbs move below 5 Hz: the
+        low-pass of a strap at 15 Hz, which the literature gives, would change nothing of `accel_L` (n, 3) [m/s^2].
+        """
+        sizes, turn = self.sizes, np.zeros((len(t), 3))
+        if sizes.tissue_random:
+            across = np.cross(E_Z, accel_L)  # the free side of the strap lags
+            turn = self.random_rms * self.random(moving_time) + self.creep_rms * self.creep(t)
+            turn = sizes.tissue_random * (turn - np.deg2rad(_WOBBLE_DEG) / GRAVITY * across)
+        if sizes.tissue_gain:
+            turn = turn + sizes.tissue_gain * self.follow(pose)
+        if sizes.sway and self.part == "torso":
+            rate, phase = self.breath
+            turn[:, 1] += sizes.sway * np.sqrt(2.0) * np.deg2rad(_BREATH_DEG) * np.sin(rate * t + phase)
+        return turn

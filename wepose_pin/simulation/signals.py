@@ -5,8 +5,11 @@ All are closed forms, exact between the samples, with four continuous derivative
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+Streams = Mapping[str, np.random.Generator]  # of random numbers, by their names
 _TOP_RATE = 2.0 * np.pi * 1.0  # [rad/s] the fastest wave of a `Process`: limbs' tissue follows slower motion than that
 _WAVES = 12
 

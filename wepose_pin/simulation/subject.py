@@ -1,29 +1,28 @@
-"""`simulate`: the paper's upper-body experiment with known truth; and the IMU data that any motion gives."""
+"""`simulate` and `simulate_activity`: people with known truth, and the IMU data that their motion gives."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments, check_names
-from ..body import DEFAULT_BODY, SEXES, load_table
+from ..body import DEFAULT_BODY, SEXES, load_model, load_table
 from ..body.girdle import FIXED
 from ..body.kinematics import Pose
 from ..body.subject import BodyLength, Subject, population_subject
-from ..errors import BadOption
+from ..errors import BadOption, one_of
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock, bridge, mark_lost_samples
 from ..rotations import compose, heading, log
-from .imperfections import IDEAL_PRESET, Imperfections
-from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
-from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, find_task
-from .people import Flaws
-from .soft_tissue import SoftTissue
+from .activities import ACTIVITIES
+from .imperfections import GRAVITY, IDEAL_PRESET, MTI_3, Device, Imperfections, ImuNoise, draw_lost, jitter_time
+from .motion import PARTS, SEGMENTS, STAND_S, BodyMotion, Motion
+from .people import E_Z, BodyPose, Flaws, SoftTissue
 
 _MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
@@ -35,12 +34,6 @@ PEOPLE_MEASURED_STD = 0.012
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
 _STEPS = (0, -2, -1, 1, 2)  # of the poses that an acceleration follows from
 _MIDPOINTS = (np.arange(4) + 0.5) / 4.0  # of an interval's quarters, for its mean
-# Streams of random numbers; "-" are those of what there was: a seed keeps its person.
-_STREAMS = (
-    "motion strap noise palm_slip - - - sway - device clock_jitter clock_offset dropped mount task tissue_gain "
-    "tissue_random breath creep - girdle_person girdle_wander girdle_rest carrying_angle elbow_abduction start_pose "
-    "start_heading sway_tilt wrist gyro_warm_up clock_drift"
-).split()
 
 
 @dataclass(frozen=True)
@@ -210,24 +203,64 @@ def simulate(
         raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
     if clasp_s < 5.0:
         raise BadOption(f"clasp_s {clasp_s} must be at least 5")
-    task, rngs = find_task(protocol), spawn_streams(seed)
-    lengths = {name: float(lengths[name]) for name in names}
-    flaws = Flaws(imperfections, rngs, lengths)
-    motion = task(lengths, rngs["motion"], protocol.split("+"), clasp_s, circles, flaws)
-    motion.fit_to_person(rngs["task"])
-    return measure_motion(motion, rngs, rate_hz, noise)
+    parts = protocol.split("+")
+    if not set(parts) <= set(PARTS) or len(set(parts)) < len(parts):
+        raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(PARTS, protocol)}; or several joined by +")
+    flaws = Flaws(imperfections, seed, {name: float(lengths[name]) for name in names})
+    return measure_motion(Motion(flaws, parts, clasp_s, circles), rate_hz, noise)
 
 
-def spawn_streams(seed: int) -> dict[str, np.random.Generator]:
-    """Spawn the streams of random numbers by their names."""
-    return dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
-
-
-def measure_motion(
-    motion: BodyMotion, rngs: Mapping[str, np.random.Generator], rate_hz: float, noise: ImuNoise
+def simulate_activity(
+    activity: str,
+    *,
+    seed: Count,
+    rate_hz: Positive = 100.0,
+    noise: ImuNoise = MTI_3,
+    imperfections: Imperfections = IDEAL_PRESET,
+    seconds: Positive = 40.0,
+    lengths: Mapping[str, float] | None = None,
 ) -> Simulation:
-    """Measure a motion with a sensor on each segment of its `p_LS`, by the streams of `spawn_streams`."""
-    sizes = motion.flaws.sizes
+    """Simulate an activity with known truth: of the whole body with a sensor on each of 15 segments, or of the arms.
+
+    0 to 5 s static in the N-pose, `seconds` of the activity, 2 s static.
+
+    Parameters
+    ----------
+    activity : "walk", "sit", "run", "throw" of the whole body, or "tasks" of the arms
+    seed, rate_hz, noise : as in `simulate`
+    imperfections : as in `simulate`. Activities of the whole body leave sway and wrists out; of soft tissue the legs
+        have the random part only, and what people hold in the start pose they hold throughout
+    seconds : [s] duration of the activity
+    lengths : of the body [m]; those not named, or None: a person of 1.75 m
+
+    Returns
+    -------
+    Simulation
+        As that of `simulate`.
+
+    Raises
+    ------
+    BadOption, BadModel
+        No such activity; too short for it; a length that the body does not have.
+
+    Examples
+    --------
+    >>> wp.simulate_activity("walk", seed=1, seconds=8.0)
+    Simulation(15.0 s at 100 Hz, 15 sensors)
+    """
+    check_arguments(simulate_activity, locals())
+    if activity not in ACTIVITIES:
+        raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
+    model = load_model(ACTIVITIES[activity].body, lengths)
+    # Shoulders that do not move: those of people that do are placed by their own girdle, not by the one tracked with.
+    model = replace(model, girdles=dict.fromkeys(model.table.girdles, FIXED))
+    flaws = Flaws(imperfections, seed, model.lengths)
+    return measure_motion(ACTIVITIES[activity](model, seconds, flaws), rate_hz, noise)
+
+
+def measure_motion(motion: BodyMotion, rate_hz: float, noise: ImuNoise) -> Simulation:
+    """Measure a motion with a sensor on each segment of its `p_LS`."""
+    sizes, rngs = motion.flaws.sizes, motion.flaws.rngs
     n = int(np.floor(motion.end * rate_hz)) + 1
     time = np.arange(n) / rate_hz
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
@@ -259,12 +292,12 @@ def measure_motion(
             ages = sizes.accel_average / rate_hz * _MIDPOINTS
             force_S = np.mean([_sample_sensor(*worn, own_time - age)[1] for age in ages], axis=0)
 
-        device = Device.sample(rngs["device"], sizes, rngs["gyro_warm_up"])
+        device = Device(rngs["device"], sizes, rngs["gyro_warm_up"])
         readings = device.measure(rate_S, force_S, rate_hz, noise, rngs["noise"])
         dropped = draw_lost(rngs["dropped"], n, rate_hz, sizes.dropped)
-        readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
+        readings["gyro_S"][dropped] = readings["accel_S"][dropped] = np.nan
         own = {"quat_LS": R_LS.as_quat(), "quat_WS": R_WS[1:].as_quat(), "soft_tissue": soft_L[1:]}
-        for name, value in {**own, **readings._asdict(), "device": device, "sample_time": own_time}.items():
+        for name, value in {**own, **readings, "device": device, "sample_time": own_time}.items():
             sensors[name][segment] = value
 
     return Simulation(
