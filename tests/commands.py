@@ -7,7 +7,7 @@ import inspect
 import pytest
 
 from wepose_pin.commands import main
-from wepose_pin.commands.command_line import APP
+from wepose_pin.commands.options import APP
 
 
 def run(*words: object) -> int:

@@ -20,8 +20,7 @@ from commands import options, run
 
 import wepose_pin as wp
 from wepose_pin import Recording, Simulation, __version__, load_subject
-from wepose_pin.commands.command_line import COMMANDS, parse
-from wepose_pin.commands.options import read_descriptions
+from wepose_pin.commands.options import COMMANDS, parse, read_descriptions
 from wepose_pin.writers import write_session
 
 

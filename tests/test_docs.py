@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin
 from wepose_pin.calibration import load_protocol
-from wepose_pin.commands.command_line import COMMANDS
+from wepose_pin.commands.options import COMMANDS
 from wepose_pin.filters import TYPICAL
 from wepose_pin.retargeting.maps import read_map
 

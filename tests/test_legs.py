@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin import NOISE_FREE, Simulation, WeposeError, evaluate, joint_angles, load_model, simulate_activity
-from wepose_pin.commands.evaluate import evaluate as evaluate_result
+from wepose_pin.commands.results import evaluate as evaluate_result
 
 SIDES = ("left", "right")
 

@@ -21,7 +21,7 @@ from conftest import DATA
 from packaging.version import Version
 
 import wepose_pin as wp
-from wepose_pin.commands.command_line import COMMANDS, parse
+from wepose_pin.commands.options import COMMANDS, parse
 from wepose_pin.writers import write_session
 
 ROOT = Path(__file__).resolve().parents[1]

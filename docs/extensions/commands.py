@@ -10,7 +10,7 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 from wepose_pin.commands import main
-from wepose_pin.commands.command_line import COMMANDS
+from wepose_pin.commands.options import COMMANDS
 
 HEAD = """# Commands
 

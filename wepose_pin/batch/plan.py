@@ -1,7 +1,9 @@
-"""The plan (``PLAN.toml``): sessions, their subjects, and the steps with their options."""
+"""The plan (``PLAN.toml``): sessions, their subjects, the steps with their options. Places are paths or URLs."""
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import inspect
 import os
 import re
@@ -11,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from ..body import list_breadths, load_table
-from ..commands.command_line import APP, parse
+from ..commands.options import APP, parse
 from ..data_tables import read_table
 from ..documents import TomlTable, read_toml
-from ..errors import BadPlan, WeposeError, one_of
-from .storage import find_urls, is_remote
+from ..errors import BadOption, BadPlan, MissingFile, WeposeError, one_of, reason
 
 # Step → what its command takes by position; in the order in which they run.
 STEPS = {
@@ -185,9 +186,7 @@ def _list_sessions(keys: TomlTable, path: Path) -> Iterator[TomlTable]:
 
 def _derive_name(session: str, path: Path) -> str:
     """A name from the path of a session: its folders below the plan's, or below the bucket."""
-    place = (
-        session.partition("://")[2].partition("/")[2] if is_remote(session) else os.path.relpath(session, path.parent)
-    )
+    place = re.sub("^.*?://[^/]*/", "", session) if is_remote(session) else os.path.relpath(session, path.parent)
     return _sanitize(re.sub(r"/?session\.toml$|\.toml$", "", place).replace("/", "-").lstrip(".-")) or "session"
 
 
@@ -198,3 +197,33 @@ def _sanitize(text: str) -> str:
 def _resolve(text: str, path: Path) -> str:
     """A path from the folder of the file that names it; URLs and an empty text stay."""
     return text if is_remote(text) or not text else str((path.parent / text).absolute())
+
+
+# Places of files ------------------------------------------------------------------------------------------------------
+
+
+def is_remote(url: str) -> bool:
+    return "://" in url
+
+
+@contextlib.contextmanager
+def open_filesystem(url: str) -> Iterator[tuple[Any, str]]:
+    """The file system of a URL and the path on it; errors of a store, which has many kinds of its own, as one line."""
+    try:
+        import fsspec
+    except ImportError as error:
+        raise BadOption(f"{url}: {error}: pip install fsspec") from None
+    try:
+        yield fsspec.core.url_to_fs(url, use_listings_cache=False)  # a worker lives longer than listings stay true
+    except WeposeError:
+        raise
+    except Exception as error:
+        raise MissingFile(f"{url}: cannot be reached: {reason(error)}") from error
+
+
+def find_urls(pattern: str) -> list[str]:
+    """Files or folders that match a path or glob, sorted."""
+    if not is_remote(pattern):
+        return sorted(glob.glob(pattern, recursive=True))
+    with open_filesystem(pattern) as (system, path):
+        return sorted(system.unstrip_protocol(match) for match in system.glob(path))

@@ -9,6 +9,7 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import signal
 import tempfile
 import threading
@@ -25,24 +26,31 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from ..commands.command_line import parse
-from ..errors import BadOption, ExistingOutput, LostWorker, WeposeError, reason
+from ..commands.options import parse
+from ..documents import whole_file, whole_folder
+from ..errors import BadData, BadOption, ExistingOutput, LostWorker, WeposeError, reason
 from ..filters.base import count_processors
-from ..writers.provenance import code, file_hashes
+from ..writers.provenance import code, file_hashes, list_named_files
 from ..writers.result import as_json
-from .plan import STEPS, Item, read_plan, write_words
-from .storage import DONE_FILE, create_folder, fetch, is_remote, open_study, read_bytes, write_bytes
+from .plan import STEPS, Item, is_remote, open_filesystem, read_plan, write_words
 
+DONE_FILE = "done.json"  # written last: an item's folder without it is not complete
 CONNECT_S = 10.0  # for which a scheduler is waited for
 DONE, FAILED, CHANGED = "done", "failed", "changed"  # status of an item
 # Columns of every row, before those of its steps.
 _COMMON = dict.fromkeys(("item", "session", "subject", "status", "error", "message"), pl.String)
-# Processes share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
+# Processes of items share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _ONE_THREAD = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
-_DIED = "the process of this item, or of one beside it, died; it may lack memory"
 
 Row = dict[str, Any]  # of the table: column → value
 RunItem = Callable[[Item], Row]
+
+
+def _fail(error: str, message: str) -> Row:
+    return {"status": FAILED, "error": error, "message": " ".join(message.split())}
+
+
+_LOST = _fail(LostWorker.__name__, "the process of this item, or of one beside it, died; it may lack memory")
 
 
 class Study(NamedTuple):
@@ -70,45 +78,32 @@ def run_batch(
     out = out.rstrip("/")
     place = f"{out}/items" if is_remote(out) else str(Path(out).absolute() / "items")
     plan = read_plan(plan_file, place)
-    names = [item.name for items in plan for item in items]
+    planned = [item for items in plan for item in items]
     rows: dict[str, Row] = {}
-    count = workers or count_processors()  # before the processes of items get one thread each
-    with open_study(out), _one_thread():
-        progress("starting workers", 0.0)
-        for items in plan:  # sessions need the calibrations
-            run = partial(run_item, place=place, force=force)
-            rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, count)
-            with contextlib.closing(rows_done) as done:
-                for row in done:
-                    rows[row["item"]] = row
-                    failed = sum(each["status"] != DONE for each in rows.values())
-                    progress(f"{len(rows)} of {len(names)} items, {failed} failed", len(rows) / len(names))
-        reused = sum(row.pop("reused", False) for row in rows.values())
-        ordered = [dict.fromkeys(_COMMON) | rows[name] for name in names]
-        table = pl.DataFrame(ordered, schema_overrides=_COMMON, infer_schema_length=None)
-        content = io.BytesIO()
-        table.write_parquet(content)
-        write_bytes(f"{out}/results.parquet", content.getvalue())
+    count = workers or count_processors()
+    os.environ |= dict.fromkeys(_ONE_THREAD.split(), "1")
+    _create_study(out)
+    progress("starting workers", 0.0)
+    for items in plan:  # sessions need the calibrations
+        run = partial(run_item, place=place, force=force)
+        rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, count)
+        with contextlib.closing(rows_done) as done:
+            for item, row in done:
+                rows[item.name] = {"item": item.name, "session": item.session, "subject": item.subject} | row
+                failed = sum(each["status"] != DONE for each in rows.values())
+                progress(f"{len(rows)} of {len(planned)} items, {failed} failed", len(rows) / len(planned))
+    reused = sum(row.pop("reused", False) for row in rows.values())
+    ordered = [dict.fromkeys(_COMMON) | rows[item.name] for item in planned]
+    table = pl.DataFrame(ordered, schema_overrides=_COMMON, infer_schema_length=None)
+    _write_table(f"{out}/results.parquet", table)
     return Study(table, reused)
 
 
 # Where items run ------------------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes that start within the block have one thread each."""
-    before = dict(os.environ)
-    os.environ.update(dict.fromkeys(_ONE_THREAD.split(), "1"))
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-
-
-def _run_here(run: RunItem, items: Sequence[Item], count: int) -> Generator[Row]:
-    """Rows of the items, in the order in which they are done, from `count` processes of this machine.
+def _run_here(run: RunItem, items: Sequence[Item], count: int) -> Generator[tuple[Item, Row]]:
+    """Items and their rows, in the order in which they are done, from `count` processes of this machine.
 
     A process that dies takes those beside it along: their items fail, and the others go on in new processes.
     """
@@ -120,17 +115,17 @@ def _run_here(run: RunItem, items: Sequence[Item], count: int) -> Generator[Row]
             for future in as_completed(futures):
                 if future.exception() is None:
                     todo.remove(futures[future])
-                    yield future.result()
+                    yield futures[future], future.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(active_children()) - before:  # when stopped, an item may have minutes to go
                 process.terminate()
         # Items begin in their order: the first of those left were running.
         lost, todo = todo[:count], todo[count:]
-        yield from (_fail(item, LostWorker.__name__, f"{item.session}: {_DIED}") for item in lost)
+        yield from ((item, dict(_LOST)) for item in lost)
 
 
-def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Generator[Row]:
+def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Generator[tuple[Item, Row]]:
     """The same by the workers of a running Dask scheduler; `LostWorker` where it goes meanwhile."""
     try:
         from distributed import Client, KilledWorker
@@ -146,11 +141,11 @@ def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Gene
             try:
                 row = future.result()
             except KilledWorker:  # after several workers died at it
-                row = _fail(futures[future], LostWorker.__name__, f"{futures[future].session}: {_DIED}")
+                row = dict(_LOST)
             except CancelledError:
                 again = "the scheduler is gone; the same command goes on where it stopped"
                 raise LostWorker(f"{address}: {again}") from None
-            yield row
+            yield futures[future], row
 
 
 def _prepare_process() -> None:
@@ -175,22 +170,14 @@ def run_item(item: Item, place: str, force: bool) -> Row:
     """
     begin = time.perf_counter()
     try:
-        row = _describe(item) | _run_unless_done(item, f"{place}/{item.name}", force)
+        row = _run_unless_done(item, f"{place}/{item.name}", force)
     except Exception as error:
         message = str(error)
         if not isinstance(error, WeposeError):  # a bug of ours: other items continue, and the table says where it is
             last = traceback.extract_tb(error.__traceback__)[-1]
             message += f" ({Path(last.filename).name}:{last.lineno})"
-        row = _fail(item, type(error).__name__, message)
+        row = _fail(type(error).__name__, message)
     return {"seconds": time.perf_counter() - begin} | row
-
-
-def _describe(item: Item) -> Row:
-    return {"item": item.name, "session": item.session, "subject": item.subject}
-
-
-def _fail(item: Item, error: str, message: str) -> Row:
-    return _describe(item) | {"status": FAILED, "error": error, "message": " ".join(message.split())}
 
 
 def _run_unless_done(item: Item, target: str, force: bool) -> Row:
@@ -207,19 +194,19 @@ def _run_unless_done(item: Item, target: str, force: bool) -> Row:
             if not url:
                 continue
             with_truth = name == "session" and "evaluate" in item.steps  # the reference that it names
-            local[name] = fetch(url, Path(fetched), with_truth)
+            local[name] = _fetch(url, Path(fetched), with_truth)
             key[f"input {name}"] = file_hashes(local[name], with_truth)
         key = json.loads(json.dumps(key))
         done: Any = None
         with contextlib.suppress(ValueError):  # a damaged file is none
-            done = json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
+            done = json.loads(_read_bytes(f"{target}/{DONE_FILE}") or b"null")
         changed = [name for name in key if done and done["key"].get(name) != key[name]]
         if done and not changed:
             return done["row"] | {"status": DONE, "reused": True}
         if changed and not force:
             message = f"{target}: has other {', '.join(changed)}; --force runs it again, -o names another folder"
             return done["row"] | {"status": CHANGED, "error": ExistingOutput.__name__, "message": message}
-        with create_folder(target) as folder:
+        with _create_folder(target) as folder:
             row = _run_steps(item, local["session"], local.get("subject_file"), folder)
             row["seconds"] = time.perf_counter() - begin
             text = json.dumps({"key": key, "row": row}, indent=1, ensure_ascii=False)
@@ -276,3 +263,79 @@ def _run_command(step: str, places: list[str], options: Mapping[str, Any]) -> An
     command, bound = parse(write_words(step, places, options))
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         return command(*bound.args, **bound.kwargs)
+
+
+# Places, paths or URLs ------------------------------------------------------------------------------------------------
+
+
+def _read_bytes(url: str) -> bytes | None:
+    """Contents of a file; None where there is none."""
+    if not is_remote(url):
+        return Path(url).read_bytes() if Path(url).is_file() else None
+    with open_filesystem(url) as (system, path):
+        return bytes(system.cat_file(path)) if system.exists(path) else None
+
+
+def _write_table(url: str, table: pl.DataFrame) -> None:
+    content = io.BytesIO()
+    table.write_parquet(content)
+    if is_remote(url):
+        with open_filesystem(url) as (system, path):
+            system.pipe_file(path, content.getvalue())
+        return
+    with whole_file(Path(url), force=True) as partial_file:
+        partial_file.write_bytes(content.getvalue())
+
+
+def _create_study(url: str) -> None:
+    """Make the folder of a study; `ExistingOutput`: it holds something else, or cannot be made."""
+    if is_remote(url):
+        return
+    place, items = Path(url), Path(url) / "items"
+    if place.exists() and not items.is_dir() and not (place.is_dir() and not any(place.iterdir())):
+        raise ExistingOutput(f"{url}: is there and no study of wepose batch; name another folder")
+    try:
+        items.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExistingOutput(f"{url}: cannot be written: {error.strerror}") from error
+
+
+def _fetch(url: str, into: Path, truth: bool = False) -> Path:
+    """Local path of a session or another file; a remote one is copied `into` a folder, with the files that it names."""
+    if not is_remote(url):
+        return Path(url)
+    with open_filesystem(url) as (system, path):
+        if system.isdir(path):
+            path = f"{path.rstrip('/')}/session.toml"
+        top, into = path.rpartition("/")[0], Path(tempfile.mkdtemp(dir=into))
+        local = into / path.rpartition("/")[2]
+        system.get_file(path, str(local))
+        for name in list_named_files(local, truth):
+            if not (into / name).resolve().is_relative_to(into.resolve()):
+                raise BadData(f"{url}: names '{name}', outside its own folder; only files below it are fetched")
+            system.get(f"{top}/{name}", str(into / name), recursive=True)
+    return local
+
+
+@contextlib.contextmanager
+def _create_folder(url: str) -> Iterator[Path]:
+    """A folder to write into, which becomes `url`, in place of what is there, when the block succeeds.
+
+    To a URL its files are copied, with `DONE_FILE` last.
+    """
+    if not is_remote(url):
+        place = Path(url)
+        for left in (place, *place.parent.glob(f".{place.name}.partial-*")):  # also by a run that was stopped
+            shutil.rmtree(left, ignore_errors=True)
+        with whole_folder(place) as folder:
+            yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="wepose-") as temporary:
+        yield Path(temporary)
+        done = (Path(temporary) / DONE_FILE).read_bytes()
+        (Path(temporary) / DONE_FILE).unlink()
+        with open_filesystem(url) as (system, path):
+            if system.exists(path):
+                system.rm(path, recursive=True)
+            system.put(f"{temporary}/", f"{path}/", recursive=True)
+            system.pipe_file(f"{path}/{DONE_FILE}", done)

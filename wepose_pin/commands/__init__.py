@@ -2,21 +2,26 @@
 
 A command does the whole job, prints what came of it, and returns it; the exit code is 0, or the `exit_code` of what it
 returns. `main` runs the one that the command line names; `wepose_pin.batch` runs some of them for many recordings.
-`results` is the Python API's `track`, whose result prints, draws, shows and saves itself.
-
 Heavy rooms load inside the functions, so that help and mistakes in options are answered at once.
+
+Ctrl-C and SIGTERM end a command with what it has written whole, or nothing.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
 import os
 import signal
 import sys
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from ..errors import WeposeError
-from .stopping import catch_signals, describe_written, is_stopped
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_stopped: list[int] = []
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -28,12 +33,12 @@ def main(argv: list[str] | None = None) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # It warns of a home where it cannot keep its list of fonts, which changes nothing but its time.
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
-        catch_signals()
+        _catch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that knows no ± still shows the rest
     try:
-        from .command_line import parse
+        from .options import parse
 
         command, bound = parse(argv)
         code = getattr(command(*bound.args, **bound.kwargs), "exit_code", 0)
@@ -43,17 +48,65 @@ def main(argv: list[str] | None = None) -> None:
         code = 1
     except (KeyboardInterrupt, Exception) as error:
         if is_process:
-            catch_signals(signal.SIG_IGN)  # a second one would end in a traceback
-        if is_stopped() or isinstance(error, KeyboardInterrupt):
-            code, line = 130, f"stopped; {describe_written()}"
+            _catch_signals(signal.SIG_IGN)  # a second one would end in a traceback
+        if _stopped or isinstance(error, KeyboardInterrupt):
+            code, line = 130, f"stopped; {_describe_written()}"
         elif isinstance(error, WeposeError):
             code, line = 2, str(error)
         elif isinstance(error, OSError):
-            code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}; {describe_written()}"
+            code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}; {_describe_written()}"
         else:
             raise
         print(f"wepose: {line}", file=sys.stderr)
     finally:
         if is_process:
-            catch_signals(signal.SIG_IGN)
+            _catch_signals(signal.SIG_IGN)
     sys.exit(code)
+
+
+def _stop(number: int, _frame: Any) -> None:
+    _stopped.append(number)
+    raise KeyboardInterrupt
+
+
+def _catch_signals(handler: Any = _stop) -> None:
+    """From here on both raise `KeyboardInterrupt` and are remembered, or are treated as by another handler."""
+    for number in _SIGNALS:
+        signal.signal(number, handler)
+
+
+def check_stopped() -> None:
+    """Raise `KeyboardInterrupt` where a signal came and a library has swallowed what it raised."""
+    if _stopped:
+        raise KeyboardInterrupt
+
+
+def _describe_written() -> str:
+    """What a command that ends early has written all the same, whole."""
+    written = getattr(sys.modules.get("wepose_pin.documents"), "written", ())
+    folders = [str(folder) for folder in written if folder.exists()]
+    return f"{', '.join(folders)} was written before" if folders else "nothing was written"
+
+
+@contextlib.contextmanager
+def stop_requests() -> Iterator[Callable[[], bool]]:
+    """Whether a signal asked to stop. It interrupts nothing, unless nobody has looked yet or it comes twice."""
+    requests: list[int] = []
+    looked = False
+
+    def ask(number: int, frame: Any) -> None:
+        if requests or not looked:
+            _stop(number, frame)
+        requests.append(number)
+
+    def is_asked() -> bool:
+        nonlocal looked
+        looked = True
+        return bool(requests or _stopped)
+
+    before = {number: signal.signal(number, ask) for number in _SIGNALS}
+    try:
+        yield is_asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

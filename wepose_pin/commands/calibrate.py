@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from ..diagnostics import lines
 from ..errors import WrongOption
@@ -82,9 +82,8 @@ def calibrate(
     from ..writers.result import write_calibration
 
     if prior is not None and (stature is not None or sex is not None):
-        raise WrongOption(
-            "prior", prior, "has the lengths of a person; --stature and --sex narrow those of the population"
-        )
+        needed = "has the lengths of a person; --stature and --sex narrow those of the population"
+        raise WrongOption("prior", prior, needed)
     with progress_bar() as progress:
         with result_folder(out, force) as folder:
             progress("reading", 0.0)
@@ -92,17 +91,9 @@ def calibrate(
             body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
             earlier = None if prior is None else load_subject(prior)
             progress("calibrating", 1 / 3)
-            calibration = room.calibrate(
-                recording,
-                measured=measured,
-                prior=earlier,
-                stature=stature,
-                sex=sex,
-                model=body,
-                protocol=protocol,
-                method=method,
-                formulation=formulation,
-            )
+            names = ("measured", "stature", "sex", "protocol", "method", "formulation")
+            chosen: dict[str, Any] = {name: options[name] for name in names}
+            calibration = room.calibrate(recording, prior=earlier, model=body, **chosen)
             write_calibration(folder, calibration, collect_provenance("calibrate", options))
         progress("writing the report", 2 / 3)
         make = partial(report_room.render_calibration_report, calibration, recording) if report else None

@@ -13,6 +13,7 @@ from cyclopts import Group, Parameter
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, ExistingOutput, one_of
 from ..libraries import find_plugins, load_plugin
+from . import stop_requests
 from .options import (
     MORE,
     RESEARCH,
@@ -34,7 +35,6 @@ from .options import (
     described_by,
 )
 from .output import print_diagnostics, print_table, say
-from .stopping import stop_requests
 
 if TYPE_CHECKING:
     from ..body import BodyModel

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from ..diagnostics import Diagnostic, lines
 from ..errors import printable
-from .stopping import check_stopped
+from . import check_stopped
 
 WIDTH = 98  # columns of running text
 TABLE_WIDTH = 160  # rich would cut numbers off to fit a narrow terminal, which wraps by itself
