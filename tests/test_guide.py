@@ -194,7 +194,7 @@ def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> 
     assert session.run(lambda m: bool(m.view.note))[-1].view.note == (
         "Too gentle, or not alone: a7. Shake one harder, hold the others still."
     )
-    session.guide.ask(Request("again"))
+    session.guide.ask(Request("assignment"))
     rate = 12.0
     session.run(lambda _: len(session.guide.segments) == 1)
     assert session.run(lambda m: bool(m.view.note))[-1].view.note == "Hold all sensors still for a moment. Moving: a7."
@@ -228,7 +228,7 @@ def test_too_little_motion_asks_for_more_of_it(tmp_path: Path) -> None:
     session.guide.close()
     assert view.quality == "fail"
     assert view.sentence == "There was too little of the motion. More of it may be enough."
-    assert [action.name for action in view.actions] == ["more", "restart"]
+    assert [action.name for action in view.actions] == ["clasp", "start"]
 
 
 def test_a_length_gives_the_scale_and_one_that_cannot_be_is_refused(tmp_path: Path) -> None:
@@ -262,7 +262,7 @@ def test_sensors_that_were_mistaken_are_named(tmp_path: Path) -> None:
     assert (view.quality, view.sentence) == ("fail", "Some sensors sit on other segments than assigned.")
     assert "left forearm and right forearm seem to be exchanged" in view.reasons[0]
     assert "Go back to Segments" in view.reasons[0]
-    assert [action.name for action in view.actions] == ["restart"]
+    assert [action.name for action in view.actions] == ["start"]
 
 
 def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -> None:
@@ -270,9 +270,9 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     session = Session(tmp_path, worn)
     moments = session.run(lambda m: m.step == "clasp")
     assert "assignment" not in {moment.step for moment in moments}
-    session.guide.ask(Request("again"))  # is not offered
+    session.guide.ask(Request("accept"))  # is not offered
     assert session.guide.step.name == "clasp"
-    session.guide.ask(Request("restart"))
+    session.guide.ask(Request("start"))
     assert session.guide.step.name == "start"
     session.guide.ask(Request("assignment"))
     assert (session.guide.step.name, session.guide.segments) == ("assignment", {})
@@ -287,7 +287,7 @@ def test_more_motion_is_of_the_longest_part_of_a_joined_protocol_and_a_pose_is_r
     guide = session.guide
     session.run(lambda m: bool(m.view.quality))
     assert set(guide.attempt.make_recording().phases) == {"start", "clasp", "t_pose"}
-    guide.ask(Request("more"))
+    guide.ask(Request("clasp"))
     assert guide.step.name == "clasp"
     session.run(lambda m: m.step == "quality")
     assert set(guide.attempt.list_phases()) == {"start", "clasp", "t_pose"}
@@ -301,7 +301,7 @@ def test_a_full_disk_is_said_and_the_next_start_pose_begins_a_new_file(tmp_path:
     begin(session, "clasp", 1.0)
     session.guide.attempt.log.problem = "calibration-1.mcap: the recording ended: No space left on device"
     assert session.run(lambda m: bool(m.view.note))[-1].view.note.endswith("No space left on device")
-    session.guide.ask(Request("restart"))
+    session.guide.ask(Request("start"))
     assert session.guide.view().note == ""
     assert session.guide.attempt.log.path.name == "calibration-2.mcap"
     session.guide.close()

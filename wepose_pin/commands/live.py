@@ -187,6 +187,7 @@ def live(
                 samples, worn, method=method, model=body, outputs=outputs, until=should_stop, record=record, force=force
             )
     finally:
+        samples.close()
         for each in outputs:
             each.close()
     _print_end(summary, driven, record)

@@ -40,7 +40,7 @@ from ..writers.provenance import collect_provenance, result_folder
 from ..writers.result import write_calibration
 from .setup import AssignedSource, SensorSetup, rename_sensors, write_segments
 from .sources import Source
-from .state import Action, GuideView, LivePose, Output, SensorStatus, Stage, Status, StepState, StreamInfo, join_names
+from .state import Action, GuideView, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
 from .ticks import Recorder, SensorMonitor
 
 STATURE = "stature"  # that may be measured in place of a length
@@ -188,11 +188,11 @@ class Guide(Stage):
 
     def do(self, action: Action, text: str) -> None:
         self.ticks, self.text = [], text
-        if action in self._view.actions:
-            self._go_on(action)
-        else:
+        if action.name in [step.name for step in self.steps]:  # it is repeated
             self._running.close()
             self._begin(action.name)
+        else:
+            self._go_on(action)
 
     def _go_on(self, action: Action | None) -> None:
         try:
@@ -244,7 +244,8 @@ class Guide(Stage):
 
     def view(self) -> GuideView:
         states = ["done"] * self._index + ["now"] + ["ahead"] * (len(self.steps) - self._index - 1)
-        steps = tuple(StepState(step.name, step.title, state) for step, state in zip(self.steps, states, strict=True))
+        pairs = zip(self.steps, states, strict=True)
+        steps = tuple({"name": step.name, "title": step.title, "state": state} for step, state in pairs)
         problem = "" if self.attempt is None else self.attempt.log.problem
         return self._view._replace(note=self._view.note or problem, steps=steps)
 

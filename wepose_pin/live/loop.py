@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ from ..body.table import check_segments
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
-from ..readers.live_log import LONGEST_TEXT
-from ..recording import ImuSensor, Recording
+from ..recording import Recording
 from ..recording.arrivals import COUNTS, CUT_OFF, MISSING, Samples, Ticks
 from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker
@@ -36,7 +35,7 @@ from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts
 from .sources import Source
 from .sources.replay import ReplaySource
-from .state import QUIT, Action, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
+from .state import LONGEST_TEXT, QUIT, Action, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names
 from .ticks import Recorder, SensorMonitor, StartPoseSearch, check_units
 
 CONNECT_S = 0.2  # [s] for which a source searches before the user is asked again
@@ -64,7 +63,7 @@ class SessionSummary(NamedTuple):
 
 
 class LiveLoop(Stage):
-    """One session, from the first sample of an open source to its end; `run` closes the source and the recording.
+    """One session, from the first sample of an open source to its end; `run` closes the recording.
 
     Parameters and errors as of `run_session`.
     """
@@ -127,17 +126,12 @@ class LiveLoop(Stage):
         finally:
             gc.unfreeze()
             sys.setswitchinterval(switch_interval)
-            self.source.close()
             self.log.close()
             if self.log.path is not None and not self._poses:
                 self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
                 self.log.path = None
-            try:
-                if self._end_message:  # when the recording is complete
-                    self.send_status()
-            finally:
-                for output in self.outputs:
-                    output.close()
+            if self._end_message:  # when the recording is complete
+                self.send_status()
         if self.log.problem:
             facts = {"variant": "disk", "reason": self.log.problem}
             self._diagnostics += (Diagnostic("file-incomplete", WARNING, str(self.log.path), facts=facts),)
@@ -313,20 +307,19 @@ def run_session(
     `model` None is the body of the setup, with the subject's lengths. Raises `WeposeError` where there is no such
     source, the mount of a sensor is not known, or the file `record` is there and `force` is not given.
     """
-    if record is not None:
-        check_absent(Path(record), force)
-    check_mounts(source, setup)
-    warm_up(method)  # before samples come
-    if not open_and_wait(source, outputs, until):
+    try:
+        if record is not None:
+            check_absent(Path(record), force)
+        check_mounts(source, setup)
+        warm_up(method)  # before samples come
+        if not open_and_wait(source, outputs, until):
+            return SessionSummary()
+        loop = LiveLoop(source, setup, method=method, model=model, record=record, force=force, outputs=outputs)
+        return loop.run(until)
+    finally:
+        source.close()
         for output in outputs:
             output.close()
-        return SessionSummary()
-    try:
-        loop = LiveLoop(source, setup, method=method, model=model, record=record, force=force, outputs=outputs)
-    except BaseException:
-        source.close()
-        raise
-    return loop.run(until)
 
 
 def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) -> bool:
@@ -334,35 +327,26 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
 
     Raises `KeyboardInterrupt` where `until` returns True meanwhile, and `WeposeError` where there is no such source.
     """
-    try:
-        source.open()
-        while not source.connect(CONNECT_S):
-            message = f"Waiting for {source.describe_awaited()}."
-            for output in outputs:
-                output.status(Status("waiting", message, problems=dict(source.problems)))
-            if until():
-                raise KeyboardInterrupt
-            if QUIT in [request for output in outputs for request in output.take_requests()]:
-                source.close()
-                return False
-    except BaseException:
-        source.close()
-        raise
+    source.open()
+    while not source.connect(CONNECT_S):
+        message = f"Waiting for {source.describe_awaited()}."
+        for output in outputs:
+            output.status(Status("waiting", message, problems=dict(source.problems)))
+        if until():
+            raise KeyboardInterrupt
+        if QUIT in [request for output in outputs for request in output.take_requests()]:
+            return False
     return True
 
 
 def warm_up(method: str) -> None:
     """Track a person who stands: compilation and reading of files must not delay the start pose, nor a correction."""
-    n, rng, upright = 200 + round(200.0 * CAUSAL_KNOT_S), np.random.default_rng(0), np.array([0.0, 0.0, 0.0, 1.0])
-    sensors = {
-        name: ImuSensor(
-            gyro_S=1e-3 * rng.standard_normal((n, 3)),
-            accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
-            stated_quat_LS=upright,
-        )
-        for name in tuple(load_table().segments)[:5]
-    }
-    recording = Recording("warm", np.arange(n) / 100.0, 100.0, sensors, {"start": ((0.0, 1.9),)})
+    n, rng, names = 200 + round(200.0 * CAUSAL_KNOT_S), np.random.default_rng(0), tuple(load_table().segments)[:5]
+    sensors: dict[str, Any] = {"phases": {"start": ((0.0, 1.9),)}, "mounts": dict.fromkeys(names, ("+z", "+x"))}
+    for name in names:
+        accel_S = [0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3))
+        sensors[name] = 1e-3 * rng.standard_normal((n, 3)), accel_S
+    recording = Recording.from_arrays(100.0, **sensors)
     find_unseen_rate(np.zeros((200, 3)), np.tile([0.0, 0.0, 9.81], (200, 1)), 100.0)
     source = ReplaySource(recording, math.inf)
     LiveLoop(source, SensorSetup.from_recording(recording), method=method).loop(lambda: False)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import contextlib
 import hashlib
 import hmac
 import json
@@ -26,7 +25,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
-from ipaddress import IPv4Address
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,11 +42,12 @@ from ..report.viewer import DARK, LIGHT, choose_trail_colour, fill_page, find_fl
 from ..retargeting.targets import find_person_arm
 from ..retargeting.visuals import MeshPart, build_parts, place_beside_person
 from .sources.udp import LOOPBACK, name_host
-from .state import QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
+from .state import LONGEST_TEXT, QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
 
 if TYPE_CHECKING:
     from .robot import RobotOutput
 
+LOCAL_HOSTS = (LOOPBACK, "localhost")
 FINGERS = 0.1  # [m] beyond the end of a limb
 DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.6, 0.8]])
 MAX_REQUESTS = 16  # not yet taken; more are dropped
@@ -78,7 +78,6 @@ class LivePage(Output):
         self.newest_status: Status | None = None
         self.clients: set[Stream] = set()
         self.requests: deque[Request] = deque(maxlen=MAX_REQUESTS)
-        self._encoded: tuple[Status | None, str] = None, ""  # the newest status that was sent, and as what
         self._closing, self._thread = threading.Event(), threading.Thread()
         self.set_body(model)
 
@@ -93,7 +92,7 @@ class LivePage(Output):
             text = f"the live page cannot listen on {host}:{port}: {error.strerror}; another port, or 0 for a free one"
             raise BadOption(text) from None
         listening.setblocking(False)
-        self.token = "" if host in (LOOPBACK, "localhost") else secrets.token_urlsafe(16)
+        self.token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         self.url = f"http://{name_host(host)}:{listening.getsockname()[1]}/"
         self.url += f"?token={self.token}" if self.token else ""
         self._thread = threading.Thread(target=asyncio.run, args=(self._serve(listening),), daemon=True)
@@ -142,7 +141,7 @@ class LivePage(Output):
         server.stop()
         for client in list(self.clients):
             if self.newest_status is not None:
-                client.send(self._encode_status(self.newest_status))
+                client.send(encode_status(self.newest_status))
             client.close(1001, "ended")
         for _ in range(int(GOODBYE_S / 0.01)):
             if self.clients:
@@ -160,17 +159,11 @@ class LivePage(Output):
                 continue
             if status is not None and client.status is not status:
                 client.status = status
-                client.send(self._encode_status(status))
+                client.send(encode_status(status))
             if client.drawn is not drawn:
                 client.drawn = drawn
                 frame = frame or encoder.encode(pose)
                 client.send(frame)
-
-    def _encode_status(self, status: Status) -> str:
-        """A status as JSON: its fields, null for what is not known."""
-        if self._encoded[0] is not status:
-            self._encoded = status, json.dumps(_to_json(status), allow_nan=False)
-        return self._encoded[1]
 
 
 class PoseEncoder:
@@ -256,19 +249,17 @@ def _stack(placements: Sequence[Any]) -> np.ndarray:
 
 
 class Guarded(RequestHandler):  # type: ignore[misc]
-    """Answers only under an address or ``localhost``, with the token where there is one, and to its own page."""
+    """Answers only with the token, where there is one, else under this machine's own address."""
 
     def initialize(self, page: LivePage) -> None:
         self.page = page
 
     def prepare(self) -> None:
-        host, origin, token = self.request.host, self.request.headers.get("Origin"), self.page.token
-        if not _is_address(host, self.page.host):
-            raise HTTPError(403, reason="This page is known by address, or as localhost.")
-        if origin is not None and origin != f"http://{host}":
-            raise HTTPError(403, reason="This page speaks to itself only.")
+        token = self.page.token
         if token and not hmac.compare_digest(self.get_query_argument("token", "").encode(), token.encode()):
             raise HTTPError(403, reason="The address of this page has a token, as the terminal shows it.")
+        if not token and self.request.host_name not in LOCAL_HOSTS:  # a foreign page's name may resolve to this machine
+            raise HTTPError(403, reason="This page is known as 127.0.0.1 or localhost.")
 
     def set_default_headers(self) -> None:
         for name, value in HEADERS.items():
@@ -296,7 +287,7 @@ class Page(Guarded):
 
 
 class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
-    """The connection to one browser."""
+    """The connection to one browser; tornado refuses that of a foreign page."""
 
     def initialize(self, page: LivePage) -> None:
         super().initialize(page)
@@ -317,9 +308,12 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
         if message == "taken":
             self.pending = max(0, self.pending - 1)
         elif isinstance(message, str):
-            request = Request.parse(message)
-            if request is not None and request.action != QUIT.action:  # who watches does not end the session
-                self.page.requests.append(request)
+            with suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):  # it is no request
+                fields = json.loads(message)
+                request = Request(str(fields["action"]), str(fields.get("text", "")))
+                # Who watches does not end the session.
+                if request.action != QUIT.action and request.text.isprintable() and len(request.text) <= LONGEST_TEXT:
+                    self.page.requests.append(request)
 
     def on_close(self) -> None:
         self.page.clients.discard(self)
@@ -332,17 +326,6 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
             self.page.clients.discard(self)
         else:  # a browser that leaves during the transfer is no error
             sent.add_done_callback(lambda done: done.cancelled() or done.exception())
-
-
-def _is_address(host: str, own: str) -> bool:
-    """Whether the Host of a request is an address, localhost, or the host that was asked for.
-
-    The name of a foreign page may resolve to 127.0.0.1, and its scripts would then be of our origin.
-    """
-    name = re.sub(r":[0-9]{1,5}$", "", host.lower())
-    with contextlib.suppress(ValueError):
-        return name in ("localhost", own.lower()) or bool(IPv4Address(name))
-    return False
 
 
 def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
@@ -360,6 +343,10 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }
     return fill_page("live/templates/live.html.j2", content, title or "wepose live")
+
+
+def encode_status(status: Status) -> str:
+    return json.dumps(_to_json(status), allow_nan=False)
 
 
 def _to_json(value: Any) -> Any:

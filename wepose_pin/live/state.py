@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from abc import ABC, abstractmethod
@@ -66,26 +65,8 @@ class Request(NamedTuple):
     action: str  # its name
     text: str = ""  # that was typed for it
 
-    @classmethod
-    def parse(cls, text: str) -> Request | None:
-        """The request in a JSON object with the fields' names; None: it is none."""
-        try:
-            fields = json.loads(text)
-            request = cls(str(fields["action"]), str(fields.get("text", "")))
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            return None
-        return request if request.text.isprintable() and len(request.text) <= LONGEST_TEXT else None
-
 
 QUIT = Request("quit")
-
-
-class StepState(NamedTuple):
-    """A step of the guided session; one that is done is an action of this name."""
-
-    name: str
-    title: str
-    state: str  # "done", "now", "ahead"
 
 
 class GuideView(NamedTuple):
@@ -96,7 +77,7 @@ class GuideView(NamedTuple):
     countdown: float | None = None  # [s] until it begins, or until the start pose was held
     remaining: float | None = None  # [s] of motion that are left
     progress: float = 0.0  # 0 to 1 of this step
-    steps: tuple[StepState, ...] = ()
+    steps: tuple[Mapping[str, str], ...] = ()  # `name`, `title` and `state` of each: "done", "now", "ahead"
     actions: tuple[Action, ...] = ()  # of this step; the first is the usual one
     highlight: str = ""  # segment to draw apart from the others
     demonstration: str = ""  # phase of the protocol to draw; empty: the start pose

@@ -53,11 +53,11 @@ REMEDIES = {
 CONTINUE = Action("next", "Continue", "n")
 READY = Action("next", f"I am ready ({GET_READY_S:.0f} s to take the pose)", "n")
 FINISH = Action("next", "Finish", "n")
-AGAIN = Action("again", "Once more", "a")
-ANEW = Action("again", "Assign all anew", "a")
-RESTART = Action("restart", "All again from the start pose", "a")
 ACCEPT = Action("accept", "Accept and track", "y")
-MORE = Action("more", f"{MORE_S:.0f} s more motion", "m")
+# These repeat a step, whose name they have.
+AGAIN = Action("start", "Once more", "a")
+ANEW = Action("assignment", "Assign all anew", "a")
+RESTART = Action("start", "All again from the start pose", "a")
 MEASURE = Action("measure", "Use this length", "l")  # its entry names the length
 
 
@@ -66,7 +66,7 @@ def run_guide(
 ) -> tuple[AssignedSource, SensorSetup] | None:
     """Lead the person to an accepted calibration, and save its subject; None where it was ended before.
 
-    Returns the source and the setup to track with. The source, not open before, stays open then, the outputs always.
+    Returns the source and the setup to track with. The source, not open before, stays open, and so do the outputs.
     """
     options.joined.check_body(options.model.table)
     steps = make_steps(options.joined)
@@ -75,7 +75,6 @@ def run_guide(
         return None
     guide = Guide(source, options, steps, outputs)
     if guide.run(should_stop) is None:
-        source.close()
         return None
     subject = load_subject(options.folder)
     return guide.assign_source(), replace(options.setup, subject=subject, remounted=False, mounts={})
@@ -138,15 +137,13 @@ def assign_segments(guide: Guide, asked_for: bool) -> StepRun:
             note = f"Too gentle, or not alone: {moving}. Shake one harder, hold the others still."
             if not is_calm:
                 note = f"Hold all sensors still for a moment. Moving: {moving}."
-        asked = yield GuideView(
+        yield GuideView(
             f"Shake the sensor on the {join_names([segment])}.",
             guide.describe_problems() or note,
             progress=len(guide.segments) / len(order),
             highlight=segment,
             actions=(ANEW,) if guide.segments else (),
         )
-        if asked is ANEW:
-            guide.segments, is_calm = {}, False
     return ""
 
 
@@ -176,14 +173,13 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
     seconds, do = starts[0] if starts else (START_POSE_S, "Stand still in the start pose.")
     do = " ".join(do.split())
     while True:
-        asked = None
-        while asked is not READY:
-            asked = yield GuideView(do, reason or guide.describe_problems(), actions=(READY,))
+        while (yield GuideView(do, reason or guide.describe_problems(), actions=(READY,))) is None:
+            pass
         for phase in {"start", *(step.phase for step in protocol.steps)}:
             attempt.mark("discard", phase=phase)
         begin, reason, moved, progress = guide.now + GET_READY_S, "", "", 0.0
         pose: StartPoseDetector | None = None  # from the first tick on
-        while not (asked is AGAIN or reason):
+        while not reason:
             for ticks in guide.ticks if guide.now >= begin else ():
                 pose = pose or attempt.detect_start_pose(seconds)
                 row = pose.push(ticks.gyro_S, ticks.accel_S)
@@ -204,7 +200,7 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
                     return ""
             countdown = begin - guide.now if guide.now < begin else (1.0 - progress) * seconds
             note = guide.describe_problems() or moved
-            asked = yield GuideView(do, reason or note, countdown, progress=progress, actions=(AGAIN,))
+            yield GuideView(do, reason or note, countdown, progress=progress, actions=(AGAIN,))
 
 
 # The motion ----------------------------------------------------------------------------------------------------------
@@ -244,11 +240,8 @@ def perform_motion(motion: Step, guide: Guide, asked_for: bool) -> StepRun:
                 actions=(FINISH, RESTART) if done_s > min(FINISH_AFTER_S, motion.seconds) else (RESTART,),
                 demonstration=phase,
             )
-            asked = yield view if estimate is None else _add_estimate(view, estimate, running)
-            if asked is FINISH:
+            if (yield view if estimate is None else _add_estimate(view, estimate, running)):
                 return ""
-            if asked is RESTART:
-                return "start"
         return ""
     finally:
         if running:
@@ -313,9 +306,7 @@ def show_result(guide: Guide, _: bool) -> StepRun:
     while True:
         future = calculate(partial(options.calibrate, path, dict(guide.measured)))
         while not future.done():
-            view = GuideView("The motion is being evaluated. You may move freely.", note, actions=(RESTART,))
-            if (yield view) is RESTART:
-                return "start"
+            yield GuideView("The motion is being evaluated. You may move freely.", note, actions=(RESTART,))
         calibration, reason = None, ""
         try:
             calibration = future.result()
@@ -333,11 +324,7 @@ def show_result(guide: Guide, _: bool) -> StepRun:
                     guide.accept(calibration, path.with_suffix(""))
                 except ExistingOutput as error:  # such as a full disk: the person may try again
                     note = str(error)
-            elif asked is MORE:
-                return find_longest(options.joined).phase
-            elif asked is RESTART:
-                return "start"
-            elif asked is not None and asked.name == MEASURE.name:
+            elif asked is not None:
                 try:
                     guide.measured[length] = 0.01 * float(guide.text.replace(",", "."))
                     entered, note = length, ""
@@ -348,16 +335,18 @@ def show_result(guide: Guide, _: bool) -> StepRun:
 
 def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> tuple[GuideView, str]:
     """What to say of the result, and the length that the person may measure; empty: none."""
+    options = guide.options
+    more = Action(find_longest(options.joined).phase, f"{MORE_S:.0f} s more motion", "m")
     if calibration is None:
         sentence = "This motion cannot be evaluated."
-        return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(error,)), ""
-    quality, options = calibration.quality, guide.options
+        return GuideView(sentence, actions=(RESTART, more), quality="fail", reasons=(error,)), ""
+    quality = calibration.quality
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
     begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
     open_s = format_longest([(first - begin, last - begin) for first, last in calibration.open_intervals])
     counted = [replace(d, facts={**d.facts, "intervals": open_s}) if "intervals" in d.facts else d for d in diagnostics]
     reasons = [join_text(text) for _, text in render_all(counted, REMEDIES)]
-    codes, actions = [reason.code for reason in quality.reasons], [ACCEPT, MORE, RESTART]
+    codes, actions = [reason.code for reason in quality.reasons], [ACCEPT, more, RESTART]
     if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned."
         reasons, actions = reasons[:1], [RESTART]
@@ -366,9 +355,9 @@ def _view_result(guide: Guide, calibration: Calibration | None, error: str) -> t
     elif quality.quality == "poor":
         sentence = "The calibration can be used. More motion, or one measured length, makes it better."
     elif codes and all(code.startswith(TOO_LITTLE) for code in codes):
-        sentence, actions = "There was too little of the motion. More of it may be enough.", [MORE, RESTART]
+        sentence, actions = "There was too little of the motion. More of it may be enough.", [more, RESTART]
     else:
-        sentence, actions = "This calibration must not be used.", [RESTART, MORE]
+        sentence, actions = "This calibration must not be used.", [RESTART, more]
     length = ""
     if "scale-uncertain" in codes:
         best = calibration.problem.measured_example.partition("=")[0]

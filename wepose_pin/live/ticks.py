@@ -54,26 +54,22 @@ class SensorMonitor:
         self.keeps_samples = True  # of the last `WINDOW_S`, for `collect` and to find a wrong unit
         self._source = source
         self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
-        self._history: dict[str, deque[tuple[float, int]]] = {}  # time [s] and count of the samples of the last second
+        self._times: dict[str, deque[float]] = {}  # [s] of the samples of the last second
         self._recent: dict[str, list[Samples]] = {}
 
     def push(self, samples: Iterable[Samples]) -> None:
         """Take samples in their order of arrival."""
         now = self._source.clock()
         for chunk in samples:
-            count = len(chunk.time)
-            first, newest = (float(chunk.time[0]), float(chunk.time[-1])) if count else (math.nan, math.nan)
-            if not (math.isfinite(first) and math.isfinite(newest)):
+            if not (len(chunk.time) and math.isfinite(newest := float(chunk.time[-1]))):
                 continue
             self._arrived[chunk.sensor], self.sending[chunk.sensor] = now, newest
-            history = self._history.setdefault(chunk.sensor, deque())
-            if not history or abs(first - history[-1][0]) > 1.0:  # a silence, or a clock that was set
-                history.clear()
-                history.append((first, 1))
-                count -= 1
-            history.append((max(newest, history[-1][0]), history[-1][1] + count))
-            while len(history) > 2 and history[1][0] <= newest - 1.0:
-                history.popleft()
+            times = self._times.setdefault(chunk.sensor, deque())
+            if times and abs(float(chunk.time[0]) - times[-1]) > 1.0:  # a silence, or a clock that was set
+                times.clear()
+            times.extend(chunk.time.tolist())
+            while not times[0] >= newest - 1.0:  # NaN too
+                times.popleft()
             if self.keeps_samples:
                 self._recent.setdefault(chunk.sensor, []).append(chunk)
 
@@ -92,9 +88,9 @@ class SensorMonitor:
         """Sensor → samples a second over the last second, on the source's clock; looks for a wrong unit as well."""
         self.wrong_unit = self._find_wrong_unit() if self.keeps_samples else ""
         rates = {}
-        for name, history in self._history.items():
-            (first, before), (last, count) = history[0], history[-1]
-            rates[name] = (count - before) / (last - first) if now - self._arrived[name] < 1.0 and last > first else 0.0
+        for name, times in self._times.items():
+            span_s = times[-1] - times[0]
+            rates[name] = (len(times) - 1) / span_s if now - self._arrived[name] < 1.0 and span_s > 0.0 else 0.0
         return rates
 
     def _find_wrong_unit(self) -> str:
@@ -102,11 +98,9 @@ class SensorMonitor:
         for name, recent in self._recent.items():
             recent[:] = [self.collect(name, WINDOW_S)]
             ((_, time_s, gyro_S, accel_S),) = recent
-            span_s = float(np.ptp(time_s)) if len(time_s) else 0.0
-            if span_s > 0.9 * WINDOW_S and name not in self._source.orientations:
-                rate = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / span_s)
-                if math.isfinite(rate):
-                    rates[name] = rate
+            if len(time_s) and np.ptp(time_s) > 0.9 * WINDOW_S and name not in self._source.orientations:
+                rates[name] = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / float(np.ptp(time_s)))
+        rates = {name: rate for name, rate in rates.items() if math.isfinite(rate)}
         if not rates:
             return ""
         what = f"rates of {max(rates.values()):.2g} rad/s while gravity does not turn: deg/s?"

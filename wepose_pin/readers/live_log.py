@@ -34,7 +34,6 @@ HEADER, SENSORS, EVENTS, POSES = "wepose", "/sensors/", "/events", "/pose"  # na
 FORMAT = 4  # of the header
 LONGEST_RECORD = 1 << 28  # [bytes] longer than any that we write
 MOST_RATE = 10_000.0
-LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text
 KIND = "a recording of wepose live"
 
 

@@ -104,7 +104,7 @@ function small(id, value, unit) {
 }
 
 // ---- what the person may ask for: actions that are offered, by buttons and keys
-let actions = [], steps = [], shownActions = "";
+let actions = [], guideActions = [], shownActions = "";
 function ask(action, text = "") {
   const through = socket.readyState === WebSocket.OPEN;
   if (through) socket.send(JSON.stringify({ action, text }));
@@ -134,7 +134,7 @@ function control(action) {
   return form;
 }
 function showActions() {
-  const offered = actions.filter(({ name }) => !steps.some((step) => step.name === name));
+  const offered = guided ? guideActions : actions;                       // steps to repeat are a list of their own
   const shown = JSON.stringify([guided, offered]);
   if (shown === shownActions) return;                                    // a button stays while it is pressed, a text while it is typed
   shownActions = shown;
@@ -151,20 +151,20 @@ function speak(what) {
 }
 function showGuide(guide) {
   guided = guide !== null;
-  steps = guide?.steps ?? [];
+  guideActions = guide?.actions ?? [];
   document.body.classList.toggle("guided", guided);
   $("steps").hidden = $("result").hidden = guide === null;
   $("note").hidden = !guide?.note;
   if (guide === null) return;
   $("note").textContent = guide.note;
-  $("steps").replaceChildren(...steps.map(({ name, title, state }) => {
+  $("steps").replaceChildren(...guide.steps.map(({ name, title, state }) => {
     const item = Object.assign(document.createElement("li"), { className: state });
     const inner = text(item, state === "done" ? "button" : "span", title);   // to repeat it
     if (state === "done") inner.addEventListener("click", () => ask(name));
     if (state === "now") item.setAttribute("aria-current", "step");
     return item;
   }));
-  const now = steps.find((step) => step.state === "now"), count = guide.countdown;
+  const now = guide.steps.find((step) => step.state === "now"), count = guide.countdown;
   const left = guide.remaining === null ? "" : ` · ${known(guide.remaining, 0)} s`;
   $("say").querySelector("strong").textContent = count === null ? now.title + left : Math.ceil(count);
   $("say").classList.toggle("counting", count !== null);
