@@ -168,7 +168,7 @@ def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     session.source.accel_scale = 1.0 / 9.80665
     moment = session.run(lambda m: "norm" in m.view.note)[-1]
     assert moment.step == "start"
-    assert re.search(r"accel: norm 1.*: g\? The source must give rad/s and m/s\^2", moment.view.note)
+    assert re.search(r"accel: norm 1.*: g\? State the unit .*accel_unit=g", moment.view.note)
     session.guide.close()
 
 
@@ -177,7 +177,7 @@ def test_rates_in_deg_s_are_said_before_a_sensor_is_shaken(tmp_path: Path) -> No
     session.source.gyro_scale = np.rad2deg(1.0)
     moment = session.run(lambda m: "gravity" in m.view.note)[-1]
     assert moment.step in ("sensors", "assignment")
-    assert "rad/s while gravity does not turn: deg/s? The source must give rad/s" in moment.view.note
+    assert "rad/s while gravity does not turn: deg/s? State the unit" in moment.view.note
     assert moment.time < 10.0
 
 

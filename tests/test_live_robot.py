@@ -158,18 +158,6 @@ def test_the_targets_are_those_of_a_recording(arm: retargeting.Robot, followed: 
     assert min(behind) < 0.006
 
 
-def test_a_hand_that_cannot_come_nearer_is_said_to_be_stuck(tmp_path: Path) -> None:
-    """An elbow that bends by 40 deg at most, of a person whose elbow bends by 90 and stays."""
-    urdf = write_arm(tmp_path)
-    file = urdf.with_suffix(".toml")
-    text = file.read_text().replace("[arms.right]", "[limits.position]\nelbow = [-0.7, -0.02]\n[arms.right]")
-    file.write_text(text.replace("elbow = -1.2", "elbow = -0.6"))
-    pose = person(10.0, swing=0.0, flexion=110.0)
-    run = Session(retargeting.load_robot(retargeting.find_map(str(urdf))), pose).run(live_poses(pose))
-    assert re.search(r"the right arm cannot come nearer than \d+ mm from its posture", run.commands[-1].reason)
-    assert run.stream.stuck["right"] == pytest.approx(run.commands[-1].error[0, 0], abs=0.02)
-
-
 def test_the_hands_uncertainty_is_that_of_many_draws(arm: retargeting.Robot) -> None:
     """Errors of the segments' orientations and of the arm's lengths, drawn; of the hand in the torso's frame."""
     pose, rng, n = person(0.5), np.random.default_rng(0), 20_000

@@ -198,7 +198,7 @@ class LiveLoop(Stage):
     def _start_tracking(self, begin: int, end: int) -> None:
         """Align by the start pose, ticks `begin` to `end`."""
         recording = self._stream.make_recording((begin, end), last=end)
-        diagnostics = check_units(recording, self.source)
+        diagnostics = check_units(recording)
         self._tracker.push(recording)
         self._monitor.keeps_samples = False
         self._diagnostics = (*self._tracker.diagnostics, *diagnostics)

@@ -19,7 +19,7 @@ from ..documents import Finite, TomlTable, read_toml
 from ..errors import BadOption, WrongOption
 from ..retargeting import Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
-from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream
+from ..retargeting.stream import ArmObserver, Command, CommandStream
 from ..retargeting.targets import check_person_arms
 from .loop import MAX_LATENCIES
 from .outputs import UdpSender
@@ -122,13 +122,12 @@ class RobotOutput(Output):
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """Commands that did not reach the robot, steps in which it braked to stay clear of itself, hands that stuck."""
-        name, stuck = self.robot.map.name, self.stream.stuck.items()
+        """Commands that did not reach the robot, steps in which it braked to stay clear of itself."""
+        name = self.robot.map.name
         diagnostics = [
             Diagnostic("robot-commands-lost", WARNING, name, self.skipped),
             Diagnostic("robot-stopped-for-clearance", WARNING, name, self.stream.stopping),
             Diagnostic("robot-commands-lost", WARNING, name, self._sender.dropped, facts={"variant": "unsent"}),
-            *(Diagnostic("robot-hand-off-target", WARNING, s, m, STUCK_M, {"variant": "live"}) for s, m in stuck),
         ]
         return [diagnostic for diagnostic in diagnostics if diagnostic.value]
 

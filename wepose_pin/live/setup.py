@@ -137,9 +137,6 @@ class AssignedSource(Source):
     def describe_awaited(self) -> str:
         return self.source.describe_awaited()
 
-    def explain_unit(self, key: str, unit: str) -> str:
-        return self.source.explain_unit(key, unit)
-
     def clock(self) -> float:
         return self.source.clock()
 

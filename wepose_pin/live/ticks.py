@@ -29,6 +29,7 @@ SILENT_STEP_S = 0.25  # [s] a longer step is a silence
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate of the ticks is measured if the source does not know it
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
+STATE_UNIT = "State the unit, as in --source udp:9000,{}={}, or in the description of the LSL stream."
 BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
 
 
@@ -104,15 +105,15 @@ class SensorMonitor:
         if not rates:
             return ""
         what = f"rates of {max(rates.values()):.2g} rad/s while gravity does not turn: deg/s?"
-        return f"{join_names(list(rates))}: {what} {self._source.explain_unit('gyro_unit', 'deg/s')}."
+        return f"{join_names(list(rates))}: {what} {STATE_UNIT.format('gyro_unit', 'deg/s')}"
 
 
-def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
-    """Check the sensors' values as those of a file; raises `BadData`, which says how the source states another unit."""
+def check_units(recording: Recording) -> tuple[Diagnostic, ...]:
+    """Check the sensors' values as those of a file; raises `BadData`, which says how a source states another unit."""
     try:
         return check_signals(recording)
     except WrongUnit as error:
-        raise BadData(f"{error.finding}: {error.unit}? {source.explain_unit(error.key, error.unit)}.") from None
+        raise BadData(f"{error.finding}: {error.unit}? {STATE_UNIT.format(error.key, error.unit)}") from None
 
 
 class Recorder:

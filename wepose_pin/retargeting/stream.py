@@ -45,8 +45,6 @@ JUMP_RATE = 40.0  # [rad/s] no hand rotates faster, so the tracking has jumped
 TRUST_UP_S, TRUST_DOWN_S = 0.5, 0.1  # [s] time constants of the trust
 WAITING = "waiting for a pose"
 TRUSTED = 0.9  # below it the state is "slow"
-# A hand so far off its target, while it and its joints move slower than that, for so long, is stuck.
-STUCK_M, STUCK_SPEED, STUCK_S = 0.05, 0.05, 1.0  # [m], [m/s and rad/s], [s]
 
 APPROACH_SPEED = 0.25  # [m/s] of a reference that has not reached its target yet
 APPROACH_GROWTH = 0.1  # [m/s²] of that speed, so that it also reaches a target that moves
@@ -266,8 +264,7 @@ class CommandStream:
         self._time = np.nan
         self._observed: list[ArmObservation] = []
         self._low_passes: list[_LowPass] = []
-        self._trust, self._stuck_s = np.ones(len(robot.arms)), np.zeros(len(robot.arms))
-        self.stuck: dict[str, float] = {}  # side → [m] by which its hand was off at most while its arm was stuck
+        self._trust = np.ones(len(robot.arms))
         self._references: list[_HandReference] | None = None
         self._approach_reason = self._stop_reason = self._end_reason = ""
 
@@ -356,19 +353,7 @@ class CommandStream:
             for arm, observation, trust in arms
             if trust < TRUSTED
         ]
-        reasons = [*poor, *self._find_stuck(targets, error[:, 0])]
-        return self._command("slow" if poor else "follow", "; ".join(reasons), error)
-
-    def _find_stuck(self, targets: list[HandTarget], error: np.ndarray) -> list[str]:
-        """Say which hands have been off targets that do not move, though the robot has had the time to reach them."""
-        reasons = []
-        for i, (arm, target, off) in enumerate(zip(self.robot.arms, targets, error.tolist(), strict=True)):
-            speed = max(_norm(target.velocity), float(np.abs(self.state.velocity[arm.joints]).max()))
-            self._stuck_s[i] = self._stuck_s[i] + self.dt if off > STUCK_M and speed < STUCK_SPEED else 0.0
-            if self._stuck_s[i] > STUCK_S:
-                self.stuck[arm.side] = max(off, self.stuck.get(arm.side, 0.0))
-                reasons.append(f"the {arm.side} arm cannot come nearer than {1e3 * off:.0f} mm from its posture")
-        return reasons
+        return self._command("slow" if poor else "follow", "; ".join(poor), error)
 
     def _extrapolate(self, i: int, ahead: float, moving: bool) -> HandTarget:
         """Target of arm `i`, `ahead` [s] of its newest pose; without velocity where the next pose is overdue."""

@@ -90,10 +90,6 @@ class Source(ABC):
         """Describe what is awaited, and where; empty where nothing is."""
         return ""
 
-    def explain_unit(self, key: str, unit: str) -> str:
-        """What to do where samples are in `unit`; `key` as in a session's [data], ``gyro_unit`` or ``accel_unit``."""
-        return f"The source must give rad/s and m/s^2, not {unit} ({key})"
-
     def open(self) -> None:  # noqa: B027
         """Take what is needed, such as a port; raises `WeposeError` where that cannot be done."""
 

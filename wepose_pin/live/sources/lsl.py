@@ -62,10 +62,6 @@ class LslSource(Source):
         self._name, self._segments = name, tuple(segments)
         self._streams: dict[str, Stream] = {}  # by segment
 
-    def explain_unit(self, key: str, unit: str) -> str:
-        channels = SIGNALS[:3] if key == "gyro_unit" else SIGNALS[3:]
-        return f'State the unit "{unit}" of the channels {", ".join(channels)} in the stream\'s description'
-
     def open(self) -> None:
         self._lsl = configure_pylsl()
 

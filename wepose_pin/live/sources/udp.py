@@ -188,11 +188,6 @@ class UdpSource(DatagramSource):
         self._units = {**SI, **(units or {})}
         self._clocks: dict[Any, HostClock] = {}  # of each sender
 
-    def explain_unit(self, key: str, unit: str) -> str:
-        host, port = self.address
-        at = f"{port}" if host == LOOPBACK else f"{host}:{port}"
-        return f'State the unit: --source udp:{at},{key}={unit}, or "{key}": "{unit}" in each line of JSON'
-
     def take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         by_sender: dict[Any, list[Samples]] = {}  # together, since its newest sample determines its clock best
         for datagram, sender in datagrams:
