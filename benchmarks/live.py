@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from wepose_pin.live import Output, SensorSetup, Status, run_session
-from wepose_pin.live.outputs import UdpOutput
-from wepose_pin.live.robot import RobotOutput
+from wepose_pin.live.outputs import RobotOutput, UdpOutput
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import Recording
 from wepose_pin.retargeting import CommandStream, find_map, load_robot

@@ -138,7 +138,7 @@ def scale(recording: Recording, *, gyro: float = 1.0, accel: float = 1.0) -> Rec
 def test_an_accelerometer_in_g_is_not_tracked_and_nothing_is_recorded(recording: Recording, tmp_path: Path) -> None:
     source, watcher = ReplaySource(scale(recording, accel=1.0 / 9.80665), math.inf), Watcher()
     setup, message = live.SensorSetup.from_recording(recording), r"sensors\.torso\.accel: norm 1.* m/s\^2 in phases\."
-    with pytest.raises(wp.BadData, match=message + r"start .*: g\? The source must"):
+    with pytest.raises(wp.BadData, match=message + r"start .*: g\? State the unit"):
         live.run_session(source, setup, record=tmp_path / "a", outputs=[watcher])
     assert (watcher.poses, list(tmp_path.iterdir())) == ([], [])
     assert watcher.statuses[-1].state == "ended"

@@ -30,7 +30,7 @@ from test_causal import first
 import wepose_pin as wp
 from wepose_pin import Simulation, retargeting
 from wepose_pin.live import LivePose, StreamInfo
-from wepose_pin.live.robot import RobotOutput
+from wepose_pin.live.outputs import RobotOutput
 from wepose_pin.writers import write_session
 
 pytest.importorskip("daqp")

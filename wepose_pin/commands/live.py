@@ -39,8 +39,8 @@ from .output import print_diagnostics, print_table, say
 if TYPE_CHECKING:
     from ..body import BodyModel
     from ..live import Output, SessionSummary
+    from ..live.outputs import RobotOutput
     from ..live.page import LivePage
-    from ..live.robot import RobotOutput
 
 GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
 
@@ -124,7 +124,7 @@ def live(
     """
     from ..live import find_setup, open_source, run_session
     from ..live.guide import GuideOptions, choose_protocol
-    from ..live.robot import RobotOutput, read_robot
+    from ..live.outputs import RobotOutput, read_robot
     from ..live.setup import AssignedSource, build_subject_model, check_mounts, read_segments
     from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView

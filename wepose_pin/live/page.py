@@ -45,7 +45,7 @@ from .sources.udp import LOOPBACK, name_host
 from .state import LONGEST_TEXT, QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
 
 if TYPE_CHECKING:
-    from .robot import RobotOutput
+    from .outputs import RobotOutput
 
 LOCAL_HOSTS = (LOOPBACK, "localhost")
 FINGERS = 0.1  # [m] beyond the end of a limb

@@ -101,11 +101,10 @@ def find_sensors(guide: Guide, _: bool) -> StepRun:
     needed = len(guide.options.joined.needs)
     while True:
         count, awaited = len(guide.monitor.sending) - len(guide.silent), guide.source.describe_awaited()
-        sentence = f"Strap the sensors on and switch them on: {count} of {needed} send."
-        if count >= needed:
-            sentence = f"{count} sensors send. Are all strapped on tightly?"
-        elif awaited:
-            sentence += f" Waiting for {awaited}."
+        sentence = f"{count} sensors send. Are all strapped on tightly?"
+        if count < needed:
+            where = f" Waiting for {awaited}." if awaited else ""
+            sentence = f"Strap the sensors on and switch them on: {count} of {needed} send.{where}"
         actions, progress = (CONTINUE,)[: count >= needed], min(1.0, count / max(needed, 1))
         if (yield GuideView(sentence, guide.describe_problems(), progress=progress, actions=actions)):
             return ""
@@ -169,9 +168,8 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
         guide.close()
     attempt, protocol = guide.begin_attempt(), guide.options.joined
     reason, guide.reason = guide.reason, ""
-    starts = [(step.seconds, step.do) for step in protocol.steps if step.phase == "start"]
-    seconds, do = starts[0] if starts else (START_POSE_S, "Stand still in the start pose.")
-    do = " ".join(do.split())
+    starts = [(step.seconds, " ".join(step.do.split())) for step in protocol.steps if step.phase == "start"]
+    seconds, do = (*starts, (START_POSE_S, "Stand still in the start pose."))[0]
     while True:
         while (yield GuideView(do, reason or guide.describe_problems(), actions=(READY,))) is None:
             pass
@@ -183,9 +181,8 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
             for ticks in guide.ticks if guide.now >= begin else ():
                 pose = pose or attempt.detect_start_pose(seconds)
                 row = pose.push(ticks.gyro_S, ticks.accel_S)
-                progress, moving = pose.held_s / seconds, [attempt.sensors[k] for k in pose.moving]
-                moved = f"You moved ({join_names(moving)}). Once more: {seconds:.0f} s still."
-                moved = moved if pose.state == "moved" else ""
+                progress, moving = pose.held_s / seconds, join_names([attempt.sensors[k] for k in pose.moving])
+                moved = f"You moved ({moving}). Once more: {seconds:.0f} s still." if pose.state == "moved" else ""
                 if row is not None:
                     last = float(ticks.time[row])
                     first = last - seconds + 1.0 / attempt.clock.rate_hz

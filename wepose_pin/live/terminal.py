@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import math
 import os
@@ -54,7 +53,7 @@ class TerminalView(Output):
 
     def take_requests(self) -> list[Request]:
         keys = [] if self._keyboard is None else self._keyboard.take()
-        return [request for request in map(self._press, keys) if request is not None]
+        return [*filter(None, map(self._press, keys))]
 
     def _press(self, key: str) -> Request | None:
         action = self._typing
@@ -100,12 +99,10 @@ class TerminalView(Output):
             parts = [] if guide.countdown is None else [f"begins in {math.ceil(guide.countdown)} s"]
             parts += [] if guide.remaining is None else [f"{guide.remaining:.0f} s left"]
             return "  ".join([*parts, f"{100.0 * guide.progress:.0f} %", guide.sentence])
-        parts = [f"{status.state.replace('_', ' ')}: {status.message}"]
-        if status.state == "ready":
-            parts.append("latency {:.1f} ms (p50), {:.1f} ms (p99)".format(*status.latency_ms))
-        if status.recorded_s:
-            parts.append(f"recording {status.recorded_s:.0f} s")
-        return "  ".join(parts)
+        latency = "latency {:.1f} ms (p50), {:.1f} ms (p99)".format(*status.latency_ms)
+        parts = [f"{status.state.replace('_', ' ')}: {status.message}", latency if status.state == "ready" else ""]
+        parts.append(f"recording {status.recorded_s:.0f} s" if status.recorded_s else "")
+        return "  ".join(filter(None, parts))
 
 
 class Keyboard:
@@ -123,7 +120,6 @@ class Keyboard:
                 self._before = termios.tcgetattr(fd)
                 tty.setcbreak(fd)  # Ctrl-C stays an interrupt
                 self._fd = fd
-                atexit.register(self.close)
 
     def take(self) -> list[str]:
         """Keys since the last call; never waits."""
@@ -139,4 +135,3 @@ class Keyboard:
         if fd is not None:
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(fd, termios.TCSADRAIN, self._before)
-            atexit.unregister(self.close)
