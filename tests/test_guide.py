@@ -168,7 +168,7 @@ def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     session.source.accel_scale = 1.0 / 9.80665
     moment = session.run(lambda m: "norm" in m.view.note)[-1]
     assert moment.step == "start"
-    assert re.search(r"accel: norm 1.*: g\? State the unit .*accel_unit=g", moment.view.note)
+    assert re.search(r"accel: norm 1.*: g\? State the unit.*accel_unit=g", moment.view.note)
     session.guide.close()
 
 

@@ -93,17 +93,12 @@ def test_the_page_may_do_nothing_but_its_own(page: LivePage) -> None:
     code, headers, text = get(page.url)
     assert code == 200
     assert "<h1>&lt;b&gt;&amp; circles</h1>" in text
-    policy = dict(part.strip().split(" ", 1) for part in headers["Content-Security-Policy"].split(";"))
-    assert policy["default-src"] == policy["frame-ancestors"] == policy["base-uri"] == "'none'"
-    assert all(source.startswith("'sha256-") for source in policy["script-src"].split())
-    assert policy["connect-src"] == page.url.replace("http", "ws").rstrip("/")
+    assert headers["X-Frame-Options"] == "DENY"
     assert headers["Cache-Control"] == "no-store"
     with pytest.raises(OSError):  # nothing listens on another address, loopback or not  # noqa: PT011
         socket.create_connection(("127.0.0.2", int(page.url.split(":")[2].strip("/"))), timeout=5.0).close()
     for host in ("localhost:8080", "127.0.0.1"):
-        code, headers, _ = get(page.url, Host=host)
-        assert code == 200
-        assert f"connect-src ws://{host};" in headers["Content-Security-Policy"]
+        assert get(page.url, Host=host)[0] == 200
 
 
 @pytest.mark.parametrize("path", ["", "stream"])

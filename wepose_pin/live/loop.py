@@ -137,14 +137,8 @@ class LiveLoop(Stage):
             self._diagnostics += (Diagnostic("file-incomplete", WARNING, str(self.log.path), facts=facts),)
         rows = zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True)
         counts = {name: dict(zip(COUNTS, row, strict=True)) for name, row in rows}
-        return SessionSummary(
-            self._poses,
-            self._last_pose - self._first_pose,
-            counts,
-            np.array(self._latency),
-            self._diagnostics,
-            self.log.path,
-        )
+        seconds, latency = self._last_pose - self._first_pose, np.array(self._latency)
+        return SessionSummary(self._poses, seconds, counts, latency, self._diagnostics, self.log.path)
 
     # Samples to poses ------------------------------------------------------------------------------------------------
 

@@ -136,13 +136,10 @@ def assign_segments(guide: Guide, asked_for: bool) -> StepRun:
             note = f"Too gentle, or not alone: {moving}. Shake one harder, hold the others still."
             if not is_calm:
                 note = f"Hold all sensors still for a moment. Moving: {moving}."
-        yield GuideView(
-            f"Shake the sensor on the {join_names([segment])}.",
-            guide.describe_problems() or note,
-            progress=len(guide.segments) / len(order),
-            highlight=segment,
-            actions=(ANEW,) if guide.segments else (),
-        )
+        sentence, progress = f"Shake the sensor on the {join_names([segment])}.", len(guide.segments) / len(order)
+        actions = (ANEW,) if guide.segments else ()
+        note = guide.describe_problems() or note
+        yield GuideView(sentence, note, progress=progress, highlight=segment, actions=actions)
     return ""
 
 
@@ -228,15 +225,10 @@ def perform_motion(motion: Step, guide: Guide, asked_for: bool) -> StepRun:
                 with suppress(WeposeError):
                     estimate = future.result()
                 future = None
-            view = GuideView(
-                " ".join(motion.do.split()),
-                guide.describe_problems() if guide.silent else "",
-                None if running else max(0.0, begin - guide.now),
-                max(0.0, target_s - done_s),
-                done_s / target_s,
-                actions=(FINISH, RESTART) if done_s > min(FINISH_AFTER_S, motion.seconds) else (RESTART,),
-                demonstration=phase,
-            )
+            do, note = " ".join(motion.do.split()), guide.describe_problems() if guide.silent else ""
+            countdown, left_s = None if running else max(0.0, begin - guide.now), max(0.0, target_s - done_s)
+            actions = (FINISH, RESTART) if done_s > min(FINISH_AFTER_S, motion.seconds) else (RESTART,)
+            view = GuideView(do, note, countdown, left_s, done_s / target_s, actions=actions, demonstration=phase)
             if (yield view if estimate is None else _add_estimate(view, estimate, running)):
                 return ""
         return ""

@@ -28,8 +28,6 @@ HEADER = struct.Struct(">IQ")
 HANDSHAKE_ANSWER = (b"\x03Hey OVR =D 5").ljust(64, b"\0")
 HEARTBEAT = HEADER.pack(1, 0)
 HANDSHAKE, PING, SENSOR_INFO, ROTATION = 3, 10, 15, 17
-# Packets that hold nothing for us: heartbeat, acceleration, battery, tap, error, signal and others.
-UNUSED = frozenset({0, 2, 4, 11, 12, 13, 14, 18, 19, 20, 21, 22, 26})
 NORMAL = 1  # kind of a rotation; 2 is a correction
 ARMS = "left_forearm right_forearm left_upper_arm right_upper_arm left_hand right_hand".split()
 # Place on the body → segment.
@@ -134,8 +132,6 @@ class SlimeVrSource(DatagramSource):
             if segment is not None:
                 return segment, np.array(struct.unpack_from(">4f", data, 2))
             self.count(f"orientations of {tracker.mac or 'a tracker'}/{data[0]}, whose place on the body is not known")
-        elif kind not in UNUSED and kind != ROTATION:
-            self.count(f"SlimeVR packets of type {kind}; orientations are read from type {ROTATION}")
         return None
 
     def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
