@@ -153,7 +153,6 @@ def live(
     print_diagnostics(body.diagnostics)
     outputs: list[Output] = [TerminalView(keyboard=Keyboard())]
     driven: RobotOutput | None = None
-    served: LivePage | None = None
     try:
         for text in output or ():
             name, _, argument = text.partition(":")
@@ -161,8 +160,9 @@ def live(
                 raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
             outputs.append(load_plugin("outputs", name)(argument))
         folder = _make_guide_folder(out, force) if guide else Path()
-        if page:
-            served = _open_page(body, worn.name if out is None else out.absolute().name, host, port, open)
+        title = worn.name if out is None else out.absolute().name
+        served = _open_page(body, title, host, port, open) if page else None
+        if served is not None:
             outputs.insert(0, served)
         with stop_requests() as should_stop:
             if guide:
@@ -206,7 +206,6 @@ def _make_guide_folder(out: Path | None, force: bool) -> Path:
 
 
 def _print_end(session: SessionSummary, robot: RobotOutput | None, record: Path | None) -> None:
-    """What was tracked, what the robot did, and what was recorded."""
     import numpy as np
 
     print_diagnostics(session.diagnostics)
@@ -215,9 +214,8 @@ def _print_end(session: SessionSummary, robot: RobotOutput | None, record: Path 
         p50, p99 = (1e3 * np.quantile(session.latency, (0.5, 0.99))).tolist()
         latency = f"from the newest sample to its pose {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
         title = f"{session.poses} poses in {session.seconds:.1f} s; {latency}"
-    titles = ("sensor", "samples", "ticks without", "late", "twice", "unsound", "frozen", "cut off")
-    keys = ("taken", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
-    print_table(title, titles, [(name, *(str(each[key]) for key in keys)) for name, each in session.counts.items()])
+    titles = ("sensor", "ticks without", "late", "twice", "unsound", "samples", "frozen", "cut off")
+    print_table(title, titles, [(name, *map(str, counts.values())) for name, counts in session.counts.items()])
     if robot is not None:
         posed, name = robot.states.total(), robot.robot.map.name
         shares = ", ".join(f"{100.0 * count / posed:.1f} % {state}" for state, count in robot.states.most_common())

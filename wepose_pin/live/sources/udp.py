@@ -121,9 +121,8 @@ class DatagramSource(Source):
         return waiting or self._read_new(timeout_s)
 
     def _read_new(self, timeout_s: float) -> list[Samples]:
-        samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
-        while not samples and self._socket is not None:
+        while self._socket is not None:
             left = deadline - time.monotonic()
             self.serve(time.monotonic())
             if select.select([self._socket], [], [], max(left, 0.0))[0]:
@@ -131,10 +130,11 @@ class DatagramSource(Source):
                 with contextlib.suppress(OSError):  # BlockingIOError: there are no more; else an ICMP reply
                     while len(datagrams) < MAX_DATAGRAMS:
                         datagrams.append(self._socket.recvfrom(65536))
-                samples = self.take(datagrams, time.monotonic())
+                if samples := self.take(datagrams, time.monotonic()):
+                    return samples
             if left <= 0.0:
                 break
-        return samples
+        return []
 
     def send(self, data: bytes, to: Any) -> None:
         if self._socket is not None:
