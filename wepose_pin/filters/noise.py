@@ -135,7 +135,11 @@ def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
 
 
 def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
-    return cov if np.linalg.eigvalsh(cov)[0] >= std**2 else cov + std**2 * np.eye(3)
+    """Add the variance of the floor where the covariance falls below it along any direction."""
+    floor = std**2 * np.eye(3)
+    (a, b, c), (_, d, e), (_, _, f) = (cov - floor).tolist()  # positive minors; LAPACK takes ten times as long
+    is_above = a > 0.0 and a * d > b * b and a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d) > 0.0
+    return cov if is_above else cov + floor
 
 
 def estimate_start_tilt(

@@ -13,11 +13,11 @@ import numpy as np
 from .. import rotations
 from ..errors import BadData, BadOption, one_of
 from ..recording import ImuSensor, Recording
-from .amekf import AMEKF, AmekfParams
+from .amekf import AMEKF
 from .base import Orientation, OrientationFilter, as_rows, count_processors, make_orientation
 from .complementary import GDC, NCF
 from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
-from .smekf import PUBLISHED_SMEKF, SMEKF, SmekfParams
+from .smekf import PUBLISHED_SMEKF, SMEKF
 from .smoother import SMOOTHER
 from .static import USUAL_TEST, StaticTest, find_static, make_static_records
 
@@ -160,32 +160,27 @@ class SensorFilters:
         self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float, out: Orientation
     ) -> int:
         """Start the filter; fill `out` before its first sample by filtering backward, and return that sample."""
-        noise, phase = self._noises[name], self._start or slice(0, self._test.samples(rate_hz))
+        noise, filter_, params = self._noises[name], METHODS[self._method], self._params
+        phase = self._start or slice(0, self._test.samples(rate_hz))
         quat_VS, tilt_std = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
         if self._start is None:  # the sensor may move there
             tilt_std = MOVING_TILT_STD
-        first = int(phase.start)
-
-        def make(method: str, noise: SensorNoise, quat_VS: np.ndarray) -> _Records:
-            filter_, params = METHODS[method], self._params
-            if filter_.params_type in (AmekfParams, SmekfParams):
-                params = params or filter_.params_type(tilt_std=tilt_std)
-                params = replace(params, gyro_range=gyro_range) if gyro_range < params.gyro_range else params
-            elif params is None and filter_.params_type is not None:
-                params = filter_.params_type()
-            return filter_.make_records(noise, rate_hz, quat_VS, params)
-
-        static_records = make_static_records(noise, rate_hz, self._test)
+        if params is None and filter_.params_type is not None:
+            params = filter_.params_type(**{"tilt_std": tilt_std} if filter_.has_covariance else {})
+        if gyro_range < getattr(params, "gyro_range", -np.inf):
+            params = replace(params, gyro_range=gyro_range)
+        static_records, first = make_static_records(noise, rate_hz, self._test), int(phase.start)
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
-            turn = np.nan_to_num(gyro_S[first] - noise.gyro_bias) / rate_hz
+            backward = METHODS[BEST] if self._method in OFFLINE else filter_
             mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
-            gyro, accel = as_rows(-gyro_S[first:0:-1]), as_rows(accel_S[first - 1 :: -1])
-            method = BEST if self._method in OFFLINE else self._method
-            run = make_orientation(first, mirrored, covariance=METHODS[method].has_covariance)
-            backward = tuple(record.copy() for record in static_records)
-            backward[0]["bias"] *= -1.0
-            records = backward, make(method, mirrored, rotations.turned(quat_VS, turn))
-            for call in _bind(METHODS[method], records, (gyro, accel), run):
+            start = rotations.turned(quat_VS, _find_turn(gyro_S[first] - noise.gyro_bias, rate_hz))
+            static = tuple(record.copy() for record in static_records)
+            static[0]["bias"] *= -1.0
+            records = static, backward.make_records(mirrored, rate_hz, start, params)
+            run = make_orientation(first, mirrored, covariance=backward.has_covariance)
+            for call in _bind(
+                backward, records, (as_rows(-gyro_S[first:0:-1]), as_rows(accel_S[first - 1 :: -1])), run
+            ):
                 call()
             for field, values in run.sampled().items():
                 getattr(out, field)[:first] = values[::-1]
@@ -193,7 +188,12 @@ class SensorFilters:
             if out.about_vertical is not None:  # what the backward run has corrected is none of the forward run
                 out.about_vertical[:first] = 0.0
             if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
-                turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
-                quat_VS, tilt_std = rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD
-        self._records[name] = static_records, make(self._method, noise, quat_VS)
+                quat_VS = rotations.turned(run.quat_VS[-1], -_find_turn(gyro_S[0] + run.gyro_bias[-1], rate_hz))
+                params = params if self._params else replace(params, tilt_std=MOVING_TILT_STD)
+        self._records[name] = static_records, filter_.make_records(noise, rate_hz, quat_VS, params)
         return first
+
+
+def _find_turn(rate: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return the rotation [rad] over a sample; of lost ones zero."""
+    return np.where(np.isfinite(rate), rate, 0.0) / rate_hz

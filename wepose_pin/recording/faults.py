@@ -70,23 +70,27 @@ def check_sensors(
     `samples`: sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost. `start` [s]:
     the stated start pose. `BadData`: two sensors have the same values, or one is dead all along or in the start pose.
     """
-    imus = {name: arrays for name, arrays in samples.items() if len(arrays) == 3}
-    for name, arrays in imus.items():
-        good = np.isfinite(np.hstack(arrays[1:])).all(axis=1)
-        imus[name] = arrays if good.all() else tuple(values[good] for values in arrays)
+    imus, diagnostics = {}, []
+    for name, (time, *values) in samples.items():
+        good = np.isfinite(np.hstack(values)).all(axis=1)
+        if len(values) == 2:
+            imus[name] = (time, *values) if good.all() else (time[good], *(each[good] for each in values))
+            continue
+        known = values[0][good & values[0].any(axis=1)]  # zeros mark a lost sample
+        if len(known) >= FROZEN_SAMPLES and (known == known[0]).all():
+            facts: dict[str, float | str] = {"variant": "orientation", "rows": len(known)}
+            diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, facts=facts))
     for (name, a), (other, b) in combinations(imus.items(), 2):
         if all(map(np.array_equal, a[1:], b[1:])) and np.count_nonzero(~_mark_repeats(*a[1:])) > FROZEN_SAMPLES:
             raise BadData(
                 f"{where}: sensors.{name} and sensors.{other} hold the same values in {len(a[0])} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
             )
-    diagnostics = []
     faults = find_faults(imus)
     for name, each in faults.items():
         begin, end = (float(imus[name][0][k]) for k in (0, -1))
         for fault in each:
-            first = max(fault.first, begin)
-            whole = fault.first < begin and fault.last >= end
+            first, whole = max(fault.first, begin), fault.first < begin and fault.last >= end
             if whole or (start is not None and first <= start[0] and fault.last >= start[1]):
                 when = "all along" if whole else "through the start pose"
                 raise BadData(
@@ -94,14 +98,9 @@ def check_sensors(
                     f"[sensors.{name}] out to track the others" + ("" if whole else ", or name another start pose")
                 )
         lost_s = sum(fault.last - max(fault.first, begin) for fault in each)
-        facts: dict[str, float | str] = {"signals": each[0].signals, "intervals": len(each)}
+        facts = {"signals": each[0].signals, "intervals": len(each)}
         facts |= {"start": max(each[0].first, begin), "end": each[0].last}
         diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
-    for name, (_, *values) in samples.items():
-        known = values[0][np.isfinite(values[0]).all(axis=1) & values[0].any(axis=1)]  # zeros mark a lost sample
-        if name not in imus and len(known) >= FROZEN_SAMPLES and (known == known[0]).all():
-            facts = {"variant": "orientation", "rows": len(known)}
-            diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, facts=facts))
     return faults, {name: find_gyro_range(*each[1:]) for name, each in imus.items()}, diagnostics
 
 
@@ -125,13 +124,12 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         gyro_S, accel_S = map(np.ascontiguousarray, values)
         if not (may_have_faults(gyro_S) or may_have_faults(accel_S)):
             continue
-        moves = accel_S.std(axis=0).max() > MOVING
+        own, covered, moves = list[Fault](), np.zeros(len(time), dtype=bool), accel_S.std(axis=0).max() > MOVING
+        before = float(np.nextafter(time[0], -np.inf))  # the first sample is faulty, too
         for signals, signal in ((GYRO, gyro_S), (ACCEL, accel_S)):
             dead = np.flatnonzero((signal == signal[0]).all(axis=0))
             if len(dead) == 1 and moves and _is_noisy(time, signal):
-                before, value = float(np.nextafter(time[0], -np.inf)), float(signal[0, dead[0]])
-                faults[name] = [Fault(f"{signals} {'xyz'[dead[0]]}", before, float(time[-1]), (value,))]
-        covered = np.zeros(len(time), dtype=bool)
+                own.append(Fault(f"{signals} {'xyz'[dead[0]]}", before, float(time[-1]), (float(signal[0, dead[0]]),)))
         of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
         for signals, columns, repeats, least_s in (
             (BOTH, (gyro_S, accel_S), of_gyro & of_accel, FROZEN_S),
@@ -159,13 +157,10 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
                     is_stuck &= others < FROZEN_SAMPLES and (moves or any(each[1].any() for each in samples.values()))
                 if is_stuck:
                     covered[a : b + 1] = True
-                    # At the beginning of the recording the first sample is faulty, too.
-                    begin = float(time[a] if a else np.nextafter(time[a], -np.inf))
-                    faults.setdefault(name, []).append(
-                        Fault(signals, begin, float(time[b]), tuple(columns[0][a].tolist()))
-                    )
-        if name in faults:
-            faults[name].sort(key=lambda fault: fault.first)
+                    begin = float(time[a]) if a else before
+                    own.append(Fault(signals, begin, float(time[b]), tuple(columns[0][a].tolist())))
+        if own:
+            faults[name] = sorted(own, key=lambda fault: fault.first)
     return faults
 
 
@@ -249,7 +244,8 @@ def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
 def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
     """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
     state, values = start_saturation(), np.ascontiguousarray(values)
-    if _may_saturate(values, least):
+    share = (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE)
+    if _may_saturate(values, least) and _may_saturate(values, share * find_largest(values)):
         _watch_all(state, values, least)
     return np.asarray(state["level"][0])
 
