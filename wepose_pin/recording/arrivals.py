@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compilation import kernel
+from ..compilation import compiled
 from . import ImuSensor, Sensor
 from .clocks import LONGEST_GAP_S
 from .faults import (
@@ -28,23 +28,18 @@ from .faults import (
 )
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
 
-# A sample within this share of a step from a tick counts as at the tick.
-SAME = 0.01
-# A step longer than this many usual steps contains a lost sample.
-HOLE = 1.5
+SAME = 0.01  # share of a step within which a sample counts as at the tick
+HOLE = 1.5  # usual steps; a longer step contains a lost sample
 REORDER_S = 0.02  # [s] a tick waits so long for a sample that a later one has overtaken
 WAIT_S = 0.1  # [s] a tick waits so long for a silent sensor; then the sensor is lost until its next sample
 JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor continues from there
-
 LEARNED = 100  # samples after which a noisy sensor may count as frozen
 
 MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
 COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
 
 _OUT = 1024  # ticks in a block
-# A row of a sensor's buffer: time, gyro, accel.
-_T, _WIDTH = 0, 7
-# What is known of a sensor.
+# What is known of a sensor. A row of its buffer has seven numbers: time [s], gyro, accel.
 SENSOR = np.dtype(
     [
         ("is_orientation", np.bool_),
@@ -167,7 +162,7 @@ class StreamSynchronizer:
         self.counts, self.lost, self.frozen = state["counts"], state["lost"], state["frozen"]
         # A sensor may be much faster than the ticks.
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
-        self._buffers = np.zeros((k, room, _WIDTH))
+        self._buffers = np.zeros((k, room, 7))
         self._out = np.empty((_OUT, k, 6)), np.empty((_OUT, k), dtype=np.bool_)
 
     @property
@@ -198,7 +193,7 @@ class StreamSynchronizer:
 # The kernels below take `clock` and `sensor` as records of `CLOCK` and `SENSOR`, and a `sample` as a row of a buffer.
 
 
-@kernel
+@compiled
 def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, out_lost):  # type: ignore[no-untyped-def]
     """Take samples from `next_sample` on; returns the next sample and the number of ticks, at most `len(out)`."""
     clock, count = clocks[0], 0
@@ -209,7 +204,7 @@ def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, ou
         if count == len(out) or next_sample == len(samples):
             return next_sample, count
         sample, i = samples[next_sample], which[next_sample]
-        sensor, t = sensors[i], sample[_T]
+        sensor, t = sensors[i], sample[0]
         if _is_sound(clock, sensor, sample):
             if not sensor.is_orientation and t > sensor.newest:
                 _watch_values(sensors, sensor, sample)
@@ -221,7 +216,7 @@ def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, ou
         next_sample += 1
 
 
-@kernel
+@compiled
 def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
     """Return whether a sample and its time are plausible."""
     t, gx, gy, gz, ax, ay, az = sample
@@ -241,10 +236,10 @@ def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@compiled
 def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
     """Find whether a sensor is frozen at this sample, its newest, and at which rates its gyroscope saturates."""
-    t, values, is_first = sample[_T], sample[1:], sensor.newest == -np.inf
+    t, values, is_first = sample[0], sample[1:], sensor.newest == -np.inf
     sensor.newest = t
     if not is_first and is_same(sensor.value, values):
         sensor.repeats += 1.0
@@ -266,18 +261,18 @@ def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
         sensor.second, sensor.turns = t, 0
     sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
     watch_saturation(sensor.saturation, sample[1:4], NARROWEST_GYRO_RANGE)
-    for k in range(6):
-        sensor.before[k], sensor.value[k] = sensor.value[k], values[k]
+    sensor.before[:] = sensor.value
+    sensor.value[:] = values
 
 
-@kernel
+@compiled
 def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-def]
     """Insert a sample into its sensor's buffer, in order of time."""
-    dt, t, n = clock.dt, sample[_T], sensor.buffered
+    dt, t, n = clock.dt, sample[0], sensor.buffered
     i = n
-    while i > 0 and buffer[i - 1, _T] > t - SAME * dt:
+    while i > 0 and buffer[i - 1, 0] > t - SAME * dt:
         i -= 1
-    if i < n and buffer[i, _T] < t + SAME * dt:
+    if i < n and buffer[i, 0] < t + SAME * dt:
         sensor.counts[DUPLICATE] += 1
         return
     # Only the first tick has no tick before it: a sample before the beginning is the start of its step.
@@ -291,26 +286,23 @@ def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-de
         n -= 1
         i = max(i - 1, 0)
     for j in range(n, i, -1):
-        for m in range(_WIDTH):
-            buffer[j, m] = buffer[j - 1, m]
-    for m in range(_WIDTH):
-        buffer[i, m] = sample[m]
+        buffer[j] = buffer[j - 1]
+    buffer[i] = sample
     sensor.buffered = n + 1
     sensor.lost = False
     sensor.counts[TAKEN] += 1
     clock.newest = max(clock.newest, t)
 
 
-@kernel
+@compiled
 def _drop(sensor, buffer, count):  # type: ignore[no-untyped-def]
     """Drop the oldest samples of a buffer."""
     for j in range(sensor.buffered - count):
-        for m in range(_WIDTH):
-            buffer[j, m] = buffer[j + count, m]
+        buffer[j] = buffer[j + count]
     sensor.buffered -= count
 
 
-@kernel
+@compiled
 def _is_complete(clock, sensors, buffers):  # type: ignore[no-untyped-def]
     """Return whether the next tick is complete."""
     dt, t = clock.dt, clock.begin + clock.tick * clock.dt
@@ -322,26 +314,26 @@ def _is_complete(clock, sensors, buffers):  # type: ignore[no-untyped-def]
         if sensors[s].lost:
             continue
         buffer, n = buffers[s], sensors[s].buffered
-        if n == 0 or buffer[n - 1, _T] < t - SAME * dt:
+        if n == 0 or buffer[n - 1, 0] < t - SAME * dt:
             return False
-        if buffer[n - 1, _T] >= t + REORDER_S:
+        if buffer[n - 1, 0] >= t + REORDER_S:
             continue
         i = _find_sample(buffer, n, t, dt)
-        if i > 0 and buffer[i, _T] - buffer[i - 1, _T] > HOLE * dt and buffer[i - 1, _T] > t - clock.wait_s:
+        if i > 0 and buffer[i, 0] - buffer[i - 1, 0] > HOLE * dt and buffer[i - 1, 0] > t - clock.wait_s:
             return False  # a sample in the gap may still arrive
     return True
 
 
-@kernel
+@compiled
 def _find_sample(buffer, n, t, dt):  # type: ignore[no-untyped-def]
     """Find the first sample at or after `t`; n: there is none."""
     i = 0
-    while i < n and buffer[i, _T] < t - SAME * dt:
+    while i < n and buffer[i, 0] < t - SAME * dt:
         i += 1
     return i
 
 
-@kernel
+@compiled
 def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-untyped-def]
     """Write the next tick into `out` (k, 6), and drop the samples that no later tick needs."""
     dt, t = clock.dt, clock.begin + clock.tick * clock.dt
@@ -361,53 +353,45 @@ def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-unty
             out[s, :] = np.nan
         out_lost[s] = sensor.lost
         # The next step begins at the last sample at or before the tick.
-        done = i if i < n and buffer[i, _T] <= t + SAME * dt else i - 1
+        done = i if i < n and buffer[i, 0] <= t + SAME * dt else i - 1
         if done > 0:
             _drop(sensor, buffer, done)
     clock.tick += 1
 
 
-@kernel
+@compiled
 def _write_value(buffer, n, i, t, dt, is_orientation, out):  # type: ignore[no-untyped-def]
     """Write the sensor's values at `t` into `out` (6,); `i` is its first sample from `t` on. False: not known."""
     if i == n:
         return False
     first = i == 0
-    step = 0.0 if first else buffer[i, _T] - buffer[i - 1, _T]
-    if buffer[i, _T] - t <= SAME * dt and (first or step >= (1.0 - 2.0 * SAME) * dt):
-        for m in range(6):
-            out[m] = buffer[i, 1 + m]
+    step = 0.0 if first else buffer[i, 0] - buffer[i - 1, 0]
+    if buffer[i, 0] - t <= SAME * dt and (first or step >= (1.0 - 2.0 * SAME) * dt):
+        out[:] = buffer[i, 1:]
         return True
     bridged = max(LONGEST_GAP_S, dt) * (1.0 + 1e-6)  # [s] as in `clocks`: a single lost sample is always bridged
     if first or step - dt > bridged:
         return False
-    before, after, share = buffer[i - 1], buffer[i], (t - buffer[i - 1, _T]) / step
-    sign = 1.0
+    before, after, share = buffer[i - 1, 1:], buffer[i, 1:], (t - buffer[i - 1, 0]) / step
     if is_orientation:  # along the shorter way
-        dot = before[1] * after[1] + before[2] * after[2] + before[3] * after[3] + before[4] * after[4]
-        sign = 1.0 if dot >= 0.0 else -1.0
-    elif step <= HOLE * dt:
-        share = min(1.0, share)
-    for m in range(6):
-        out[m] = before[1 + m] + share * (sign * after[1 + m] - before[1 + m])
-    if is_orientation:
-        norm = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
-        for m in range(4):
-            out[m] /= norm
-    elif step <= HOLE * dt:
+        dot = before[0] * after[0] + before[1] * after[1] + before[2] * after[2] + before[3] * after[3]
+        out[:] = before + share * ((1.0 if dot >= 0.0 else -1.0) * after - before)
+        out[:4] /= np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+        return True
+    out[:] = before + (min(1.0, share) if step <= HOLE * dt else share) * (after - before)
+    if step <= HOLE * dt:
         # Mean rate over (t − dt, t], each sample's rate from the one before to it; mean force of the samples within,
         # or with fewer than two samples the force at t.
-        for m in range(3):
-            rate, force, covered, within, j = 0.0, 0.0, 0.0, 0, i
-            while j > 0 and buffer[j, _T] > t - dt:
-                width = max(0.0, min(buffer[j, _T], t) - max(buffer[j - 1, _T], t - dt))
-                covered += width
-                rate += width * buffer[j, 1 + m]
-                if buffer[j, _T] <= t + SAME * dt:
-                    within += 1
-                    force += buffer[j, 4 + m]
-                j -= 1
-            out[m] = rate / covered
-            if within >= 2:
-                out[3 + m] = force / within
+        rate, force, covered, within, j = np.zeros(3), np.zeros(3), 0.0, 0, i
+        while j > 0 and buffer[j, 0] > t - dt:
+            width = max(0.0, min(buffer[j, 0], t) - max(buffer[j - 1, 0], t - dt))
+            covered += width
+            rate += width * buffer[j, 1:4]
+            if buffer[j, 0] <= t + SAME * dt:
+                within += 1
+                force += buffer[j, 4:]
+            j -= 1
+        out[:3] = rate / covered
+        if within >= 2:
+            out[3:] = force / within
     return True
