@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, WeposeError
@@ -19,10 +17,6 @@ from .noise import SensorNoise, estimate_noise
 # below 3 deg/s and 3 deg. Above `MOVES` the mean pose is not the start pose; above `SWAYS` it is a warning.
 MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
 SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
-# All sensors rotate about the vertical at one rate when the person rotates: a mean rate [rad/s] above `COMMON_RATE`
-# with a probability by chance below `COMMON_RATE_CHANCE`, in three sensors or more.
-COMMON_RATE, COMMON_RATE_CHANCE, FEWEST_SENSORS = float(np.deg2rad(0.5)), 1e-3, 3
-
 # Where a sensor turns faster than `SWAYS_DEG_S` over `BLOCK_S`, it moves; a tremor averages out over so long.
 BLOCK_S = 0.2
 LEAST_STATIC_S = 1.0  # of an interval with motion in it, that must be static
@@ -54,13 +48,13 @@ def find_reference_phases(
         if len(intervals) > 1:
             facts = {"start": intervals[0][0], "end": intervals[0][1]}
             diagnostics.append(Diagnostic("phase-intervals-ignored", WARNING, phase, facts=facts))
-    start = stated[0] if stated else find_static_window(recording)
+    start, place = stated[0] if stated else find_static_window(recording), "phases.start"
     _check_samples(recording, start, "start")
     if not stated or recording.start_is_guessed:
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
         place = "the guessed start pose"
     else:
-        start, place = _find_static_part(recording, start, "start", diagnostics), "phases.start"
+        start = _find_static_part(recording, start, "start", diagnostics)
     static = start
     if lying:
         _check_samples(recording, lying[0], "static")
@@ -78,7 +72,6 @@ def find_reference_phases(
                 )
             except WeposeError as error:
                 raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
-    diagnostics += _check_common_rotation(recording, noises, static)
     return start, static, noises, diagnostics
 
 
@@ -163,38 +156,6 @@ def _check_motion(recording: Recording, segment: str, interval: tuple[float, flo
     facts: dict[str, float | str] = {"phase": place, "start": interval[0], "end": interval[1]}
     facts |= {"rotation": rotation, "rotation_limit": rotation_limit}
     return [Diagnostic("start-pose-motion", WARNING, segment, value, limit, facts)]
-
-
-def _check_common_rotation(
-    recording: Recording, noises: dict[str, SensorNoise], interval: tuple[float, float]
-) -> list[Diagnostic]:
-    """Check that the person does not rotate in a phase: the mean rate there is taken for the gyroscopes' biases.
-
-    Biases about the vertical differ from sensor to sensor; a common rate is the person's (one-sample t-test). A slow
-    rotation gives a warning and is added to the biases' covariance in `noises`.
-    """
-    up_S = {}
-    for segment in noises:
-        mean_S = recording.imus[segment].accel_S[recording.find_measured(segment, interval)].mean(axis=0)
-        up_S[segment] = mean_S / np.linalg.norm(mean_S)
-    rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
-    if len(rates) < FEWEST_SENSORS:
-        return []
-    mean, error = float(rates.mean()), max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
-    if abs(mean) < COMMON_RATE or 2.0 * stdtr(len(rates) - 1, -abs(mean) / error) > COMMON_RATE_CHANCE:
-        return []
-    turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
-    if turn_deg > MOVES_DEG:
-        raise BadPhase(
-            f"{recording.where()}: phases.start ({format_span(interval)}): all sensors turn about the vertical at "
-            f"{np.degrees(mean):.1f} deg/s, by {turn_deg:.0f} deg in all, where gyroscopes have biases of their own: "
-            f"name seconds in which the person does not turn"
-        )
-    for segment, noise in noises.items():
-        turning = mean**2 * np.outer(up_S[segment], up_S[segment])
-        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + turning)
-    facts: dict[str, float | str] = {"variant": "rotates", "rotation": float(np.deg2rad(turn_deg))}
-    return [Diagnostic("start-pose-motion", WARNING, value=abs(mean), limit=COMMON_RATE, facts=facts)]
 
 
 def find_static_window(recording: Recording) -> tuple[float, float]:
