@@ -83,7 +83,6 @@ TABLES: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
     ("", ('wrist = "wrist_1_link"', 'wrist = "wrist_link"'), ("points.wrist", "wrist_link", "did you mean")),
     ("", ('urdf = "arm.urdf"', 'urdf = "arm.urdf"\nup = "z"'), ("up = 'z'",)),
     ("", ('urdf = "arm.urdf"', 'urdf = "arm.urdf"\nup = "+x"'), ("is parallel to up",)),
-    ("", (SEGMENT, 'forearm_link = { link = "forearm_link", up = "+z" }'), ("forearm_link.forward is missing",)),
     ("", (GOOD, "segments = ["), ("not valid TOML",)),
     ("", ("arm.urdf", "leg.urdf"), ("leg.urdf", "no such file")),
     ("", (GOOD, 'urdf = "fixed.urdf"\nlike = "upper_body"\n'), ("left_upper_arm", "revolute joints")),

@@ -18,7 +18,7 @@ from ..errors import BadModel, BadSession, one_of
 from ..libraries import asset
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
-from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, read_table
+from .table import DEFAULT_BODY, MECHANISM_SEGMENT, BodyTable, Segment, find_table, load_table, read_table
 from .tree import (
     MOST_LINKS,
     build,
@@ -234,7 +234,7 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str] = (), wh
     whose text begins with `where`. Parameters and errors else as of `load_model`.
     """
     default = asset("urdf", f"{DEFAULT_BODY}.urdf")
-    file = default if path is None else Path(path)
+    file = Path(path or default)
     if not (file.suffix or file.exists() or len(file.parts) > 1):  # the name of a body of the package
         file = asset("urdf", f"{load_table(file.name).name}.toml")
     return _load_packaged_body(file) if file.parent == default.parent else _load_body(file, sensors, where)
@@ -245,7 +245,7 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
     own_table = read_table(path) if path.suffix.lower() == ".toml" else None
     urdf = path if own_table is None else path.parent / own_table.urdf
     robot = read_urdf(urdf)
-    tree, default = parse_tree(robot, str(urdf)), load_table()
+    tree = parse_tree(robot, str(urdf))
     if own_table is not None:
         for pose, values in own_table.poses.items():
             check_joint_values(robot, values, f"{own_table.where}: poses.{pose}", BadModel)
@@ -256,12 +256,13 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
                 choices = one_of(tree.below, name, MOST_LINKS)
                 raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
         links = sorted(sensors, key=lambda name: len(tree.path(name)))
-        segments = {name: Segment.of_mechanism(name, rigid=True) for name in links}
+        segments = {name: MECHANISM_SEGMENT._replace(link=name, rigid_without_sensor=True) for name in links}
         body = _build_body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(urdf)), str(urdf))
         if not body.pin.nv:
             raise BadModel(f"{urdf}: no joint moves; a chain of revolute or prismatic joints is needed")
         return body
     if table is None:
+        default = load_table()
         lacking = [name for name in default.needed if default.segments[name].link not in tree.below]
         raise BadModel(
             f"{urdf}: no link {', '.join(map(repr, lacking))}; name the segments' links in a table, as docs/models.md "

@@ -86,7 +86,8 @@ class KinematicsSolver:
             for joint, R in R_AJ.items() if len(R_AJ) == 1 else ():
                 spherical.append((row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[joint]))
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
-        self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
+        at = [m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4]
+        self._quaternions = np.reshape(at, (-1, 1)).astype(int) + np.arange(4)  # where they stand in q
         self._girdles = [
             (describe_girdle(model, name, self.segments), np.array([m.idx_qs[m.getJointId(j)] for j in girdle.joints]))
             for name, girdle in model.table.girdles.items()
@@ -111,7 +112,10 @@ class KinematicsSolver:
             motion = np.empty((len(q), 7))
             follow_law(quat_WL, *girdle, motion)
             q[:, at] = motion[:, :3]
-        _unwrap_signs(q, self._quaternions, q[0] if self._last is None else self._last)
+        # Signs by which each quaternion lies on one side with that of the row before.
+        quats, last = q[:, self._quaternions], q[0] if self._last is None else self._last
+        jumps = np.einsum("nji,nji->nj", quats, np.concatenate([last[None, self._quaternions], quats[:-1]])) < 0.0
+        q[:, self._quaternions] = quats * np.where(np.logical_xor.accumulate(jumps), -1.0, 1.0)[..., None]
         self._last = q[-1].copy()
         return q
 
@@ -223,18 +227,6 @@ def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ign
             x, y, z, w = product(x, y, z, w, right[j, 0], right[j, 1], right[j, 2], right[j, 3])
             scale, k = 1.0 / np.sqrt(x * x + y * y + z * z + w * w), at[j]
             q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3] = x * scale, y * scale, z * scale, w * scale
-
-
-@kernel
-def _unwrap_signs(q, at, before):  # type: ignore[no-untyped-def]
-    """Choose the signs of quaternions at `at` in `q` (n, nq) that lie on one side with the row before."""
-    for k in at:
-        a, b, c, d = before[k], before[k + 1], before[k + 2], before[k + 3]
-        for i in range(len(q)):
-            if a * q[i, k] + b * q[i, k + 1] + c * q[i, k + 2] + d * q[i, k + 3] < 0.0:
-                for j in range(k, k + 4):
-                    q[i, j] = -q[i, j]
-            a, b, c, d = q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3]
 
 
 class _Fit:

@@ -89,8 +89,8 @@ class Pose:
         ):
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
-                place, flags = f"{where}{name}.{key}", name == "gap"
-                check_array(place, values, shape, EACH_TIME, flags=flags, missing=True, unit=unit)
+                place = f"{where}{name}.{key}"
+                check_array(place, values, shape, EACH_TIME, flags=name == "gap", missing=True, unit=unit)
         return self
 
 
@@ -200,8 +200,7 @@ def compute_link_poses(
     # Views of Pinocchio's memory: reading data.oMf[f] for each row costs more than the kinematics.
     p_view = [data.oMf[frame].translation for frame in frames]
     R_view = [data.oMf[frame].rotation for frame in frames] if rotations else []
-    R = np.empty((len(q), len(R_view), 3, 3))
-    p = np.empty((len(q), len(frames), 3))
+    R, p = np.empty((len(q), len(R_view), 3, 3)), np.empty((len(q), len(frames), 3))
     for k, row in enumerate(np.ascontiguousarray(q)):
         pin.framesForwardKinematics(model.pin, data, row)
         for i, view in enumerate(p_view):

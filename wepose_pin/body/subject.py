@@ -13,17 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import NonNegative, Range, check_arguments, check_array, check_fields, check_names
-from ..documents import (
-    Finite,
-    Key,
-    TomlTable,
-    format_record,
-    format_toml,
-    read_record,
-    read_toml,
-    toml_string,
-    whole_file,
-)
+from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml, toml_string, whole_file
 from ..errors import BadData, BadModel, BadOption, BadSubject
 from .anthropometry import compute_population_lengths
 from .body import BodyModel
@@ -172,16 +162,13 @@ class Subject:
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadSubject` where a name is not one of the body's, or a length of the body is missing."""
         where = f"subject '{self.name}': "
-        try:
-            missing = [name for name in table.lengths if name not in self.lengths]
-            if missing:
-                raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
-            known = dict.fromkeys(("mounts", "start_pose_offset", "heading_drift"), table.segments)
-            # A body without girdles, as those of others, has its own shoulders.
-            for name, names in {**known, "hinges": table.hinges, "girdles": table.girdles or self.girdles}.items():
-                check_names(f"{where}{name}", getattr(self, name), names)
-        except BadOption as error:
-            raise BadSubject(str(error)) from None
+        if missing := [name for name in table.lengths if name not in self.lengths]:
+            raise BadSubject(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
+        for key in ("mounts", "start_pose_offset", "heading_drift"):
+            check_names(f"{where}{key}", getattr(self, key), table.segments, BadSubject)
+        check_names(f"{where}hinges", self.hinges, table.hinges, BadSubject)
+        if table.girdles:  # else, as those of others, it has its own shoulders
+            check_names(f"{where}girdles", self.girdles, table.girdles, BadSubject)
 
     def shape(self, body: BodyModel, *, remounted: bool = False) -> BodyModel:
         """Return the body with this person's lengths, girdles and means of soft tissue, unknown if `remounted`."""
@@ -206,8 +193,7 @@ class Subject:
         scatter = estimate_scatter([hinge.std for hinge in self.hinges.values()])
         for name, segment in segments.items():
             lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
-            start_var = segment.start_std[2] ** 2 - segment.start_mean[2] ** 2
-            carrier = body.parents.get(name)
+            start_var, carrier = segment.start_std[2] ** 2 - segment.start_mean[2] ** 2, body.parents.get(name)
             if carrier in personal:
                 start += personal[carrier].start_mean[2]
                 start_var += personal[carrier].start_std[2] ** 2 - segments[carrier].start_std[2] ** 2
@@ -238,10 +224,7 @@ class Subject:
 
     def std(self, name: str) -> float:
         """Return one standard deviation of a row of `order`, in its unit; NaN where there is no such row."""
-        if name not in self.order:
-            return float("nan")
-        k = self.order.index(name)
-        return float(np.sqrt(self.covariance[k, k]))
+        return float(np.sqrt(np.diag(self.covariance)[self.order.index(name)])) if name in self.order else float("nan")
 
     def lengths_covariance(self, names: Iterable[str] | None = None) -> np.ndarray:
         """Return the covariance (n, n) of the named rows of `order`, or of all lengths [m²]; zero without a row."""
@@ -272,9 +255,8 @@ class Subject:
     def mount_covariance(self, segment: str) -> np.ndarray | None:
         """Return the covariance (3, 3) [rad²] of a calibrated mount's error in L; None: the mount has none."""
         rows = mount_rows(segment)
-        if segment not in self.mounts or not set(rows) <= set(self.order):
-            return None
-        return self.lengths_covariance(rows)
+        is_known = segment in self.mounts and set(rows) <= set(self.order)
+        return self.lengths_covariance(rows) if is_known else None
 
 
 def mount_rows(segment: str) -> list[str]:
@@ -339,9 +321,8 @@ def population_subject(
             covariance[k, k] = (0.01 * length.std_percent * lengths[name]) ** 2
     rows = [order.index(name) for name in people]
     covariance[np.ix_(rows, rows)] = people_cov
-    return Subject(
-        POPULATION, lengths, order, covariance, note=note if people else f"lengths of the model {table.name}"
-    )
+    note = note if people else f"lengths of the model {table.name}"
+    return Subject(POPULATION, lengths, order, covariance, note=note)
 
 
 def subject_toml(subject: Subject) -> str:
@@ -383,10 +364,8 @@ def load_subject(path: str | Path) -> Subject:
     0.33
     """
     check_arguments(load_subject, locals())
-    path = Path(path)
-    if path.is_dir():
-        path = path / "subject.toml"
-    return _subject(read_toml(path, "a subject, as `wepose calibrate` writes one,", BadSubject), path)
+    file = Path(path) / "subject.toml" if Path(path).is_dir() else Path(path)
+    return _subject(read_toml(file, "a subject, as `wepose calibrate` writes one,", BadSubject), file)
 
 
 def parse_subject(text: str, path: Path) -> Subject:
@@ -398,10 +377,10 @@ def parse_subject(text: str, path: Path) -> Subject:
 
 
 def _subject(values: Mapping[str, Any], path: Path) -> Subject:
-    top = TomlTable(values, str(path), error=BadSubject)
-    if values.get("format") != FORMAT:
-        has = f"format = {values.get('format')!r}"
-        raise BadSubject(f"{path}: {has}; a subject, as `wepose calibrate` writes one, has format = {FORMAT}")
+    top, form = TomlTable(values, str(path), error=BadSubject), values.get("format")
+    if form != FORMAT:
+        needed = f"a subject, as `wepose calibrate` writes one, has format = {FORMAT}"
+        raise BadSubject(f"{path}: format = {form!r}; {needed}")
     top.table("lengths")
     base = Subject(path.parent.name, {}, (), np.zeros((0, 0)))
     subject = read_record(Subject, top, base=base, others=("format", "lengths_std", "covariance"))
@@ -409,7 +388,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     table.allow("order", "matrix")
     std.allow(*subject.lengths)
     order = table.texts("order") if table.values else tuple(name for name in subject.lengths if name in std)
-    covariance = np.diag([float(std.get(name, 0.0, Finite)) ** 2 for name in order])
+    covariance = np.diag([float(std.get(name, 0.0, NonNegative)) ** 2 for name in order])
     if table.values:
         try:
             covariance = np.array(table.values.get("matrix"), dtype=float)

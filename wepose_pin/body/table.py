@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
+from ..arguments import check_names
 from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml
 from ..errors import BadModel, one_of
 from ..libraries import asset
@@ -24,7 +25,6 @@ from .girdle import Direction, Girdle, SegmentName
 DEFAULT_BODY = "upper_body"
 ROOT = "root"  # the origin of W, as the end of a length
 NEUTRAL_POSE = "n_pose"
-KINDS = ("person", "mechanism")
 # Regular expressions of the side in a sensor's name, in English and German.
 _SIDES = {"left": "left|lt?|link(s|e[rsmn]?)", "right": "right|rt?|recht(s|e[rsmn]?)"}
 
@@ -61,9 +61,6 @@ class Segment(NamedTuple):
     """A segment of a body; standard deviations are about its axes."""
 
     link: str  # in the URDF
-    # The link's axes that point up and forward in the N-pose; None: found with all joints at zero.
-    up: Annotated[str | None, Key(of="axes")] = None
-    forward: Annotated[str | None, Key(of="axes")] = None
     # Unit, its long axis in its own frame, away from the joint to the segment above.
     along: Direction = (0.0, 0.0, -1.0)
     spine: bool = False  # its rotation is shared by all joints between it and the root
@@ -78,12 +75,9 @@ class Segment(NamedTuple):
     start_std: Angles = _same(4.0)  # [rad] of its rotation off the start pose among people
     repeat_std: Angles = _same(2.0)  # [rad] the same between two start poses of one person
 
-    @classmethod
-    def of_mechanism(cls, link: str, *, rigid: bool) -> Segment:
-        """Return a segment of a mechanism: no soft tissue, and a start configuration to 0.5° (assumption)."""
-        return cls(
-            link, rigid_without_sensor=rigid, soft_tissue=SoftTissue(), start_std=_same(0.5), repeat_std=_same(0.5)
-        )
+
+# Of a mechanism: no soft tissue, and a start configuration to 0.5° (assumption).
+MECHANISM_SEGMENT = Segment("", soft_tissue=SoftTissue(), start_std=_same(0.5), repeat_std=_same(0.5))
 
 
 class Point(NamedTuple):
@@ -155,10 +149,6 @@ class Limb(NamedTuple):
     base: str | None  # the segment of the body to which it belongs; None: the root
     # Its first point, with that of the other side where there is one, left first: distances are from their middle.
     origin: tuple[str, ...]
-
-    @property
-    def tip(self) -> str:
-        return self.points[-1]
 
 
 @dataclass(frozen=True)
@@ -323,11 +313,9 @@ def read_table(path: Path) -> BodyTable:
     top = TomlTable(read_toml(path, "the table of a body", BadModel), str(path), error=BadModel)
     own = {key: top.table(key, {}).values for key in ("segments", "points", "lengths", "hinges")}
     like = load_table(top.choice("like", _list_bodies())) if "like" in top else BodyTable("", {})
-    kind: Any = top.choice("kind", KINDS, like.kind)
-    new = Segment.of_mechanism("", rigid=False) if kind == KINDS[1] else Segment("")
-    segments = {
-        name: like.segments.get(name, new)._replace(link=name, up=None, forward=None) for name in own["segments"]
-    }
+    kind: Any = top.choice("kind", ("person", "mechanism"), like.kind)
+    new = MECHANISM_SEGMENT if kind == "mechanism" else Segment("")
+    segments = {name: like.segments.get(name, new)._replace(link=name) for name in own["segments"]}
     whole = not set(segments) & set(like.segments)  # the same body with more on it
     segments = {**like.segments, **segments} if whole else segments
     begin = {segment.link: name for name, segment in like.segments.items() if name in segments}
@@ -367,22 +355,15 @@ def _normalise_hinge(place: str, hinge: HingeJoint) -> HingeJoint:
 
 def _check_table(table: BodyTable, top: TomlTable) -> None:
     """Raise `BadModel` on names that the table does not know, parallel axes, and labels that are no expression."""
-    drawn = (*(point for limb in table.draw.limbs for point in limb), *table.draw.paths)
     names = (*table.segments, *table.points, *table.lengths, *table.hinges)
-    for key, used, known in (
-        ("girdles", tuple(table.girdles), table.points),
-        ("pairs", tuple(table.pairs), names),
-        ("draw", drawn, table.points),
-    ):
-        if (name := next((name for name in used if name not in known), None)) is not None:
-            raise BadModel(f"{top.at(key)}: '{name}' is not known; {one_of(known, name)}")
+    check_names(top.at("girdles"), table.girdles, table.points, BadModel)
+    check_names(top.at("pairs"), table.pairs, names, BadModel)
+    for points in (*table.draw.limbs, table.draw.paths):
+        check_names(top.at("draw"), points, table.points, BadModel)
     if any(len(limb) < 2 for limb in table.draw.limbs):
         raise BadModel(f'{top.at("draw.limbs")}: lists of points are wanted, as [["hip", "knee", "ankle"]]')
     read_axes(top, table.up, table.forward)
     for name, segment in table.segments.items():
-        if segment.up is not None or segment.forward is not None:
-            axes = {"up": segment.up, "forward": segment.forward}
-            read_axes(replace(top, values=axes, place=f"segments.{name}."))
         try:
             re.compile(segment.labels)
         except re.error as error:

@@ -75,8 +75,7 @@ class Tree(NamedTuple):
 
     def find_above(self, link: str, names: Mapping[str, str]) -> str | None:
         """Find the name of the nearest link between `link` and the root that has one in `names`."""
-        above = [names[joint.parent] for joint in self.path(link) if joint.parent in names]
-        return above[-1] if above else None
+        return next((names[joint.parent] for joint in reversed(self.path(link)) if joint.parent in names), None)
 
 
 def parse_tree(robot: Any, where: str) -> Tree:
@@ -98,8 +97,7 @@ def parse_tree(robot: Any, where: str) -> Tree:
         numbers = np.concatenate([np.ravel(joint.origin), np.ravel(axis)]).astype(float)
         if np.shape(joint.origin) != (4, 4) or np.shape(axis) not in ((0,), (3,)) or not (np.abs(numbers) < _FAR).all():
             raise BadModel(f"{where}: joint '{joint.name}': origin or axis is not three numbers each, of m and rad")
-    roots = [name for name in below if name not in above]
-    if len(roots) != 1:
+    if len(roots := [name for name in below if name not in above]) != 1:
         names = ", ".join(roots) or "none"
         raise BadModel(f"{where}: {len(roots)} links without a joint above them ({names}); a body has one root")
     tree = Tree(roots[0], above, below)
@@ -109,14 +107,7 @@ def parse_tree(robot: Any, where: str) -> Tree:
 
 
 def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
-    """Name links of the robot (yourdfpy) after segments and points, in place; return it and the table of these names.
-
-    A mechanism's segments have their links' frames, and so have those of a URDF whose links bear the segments' names.
-    Else every segment frame equals W in the N-pose. At zero of its joints a body may stand otherwise, in a T-pose say.
-    There segments of the spine are upright. Others lie along the line between the points of their length, by the
-    shortest rotation of their long axis; a segment without a length is as the segment above. `up` and `forward` of a
-    segment are taken in place of that.
-    """
+    """Name links of the robot (yourdfpy) in place after segments and points; return it and its table."""
     tree = parse_tree(robot, table.where)
     places = [(f"segments.{name}", segment.link) for name, segment in table.segments.items()]
     places += [(f"points.{name}", point.link) for name, point in table.points.items()]
@@ -145,7 +136,7 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
             carrier = segment_of.get(point.link) or tree.find_above(point.link, segment_of)
             link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
             frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
-    segments = {name: segment._replace(link=name, up=None, forward=None) for name, segment in table.segments.items()}
+    segments = {name: segment._replace(link=name) for name, segment in table.segments.items()}
     named = replace(table, segments=segments, points=points, up="+z", forward="+x", root=())
 
     added: dict[str, tuple[str, np.ndarray]] = {}  # name → the link it is fixed to, and its placement there
@@ -161,24 +152,25 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
 def _neutral_orientation(
     table: BodyTable, name: str, M_WK: Mapping[str, np.ndarray], p_W: Mapping[str, np.ndarray], R_above: np.ndarray
 ) -> np.ndarray:
-    """Return R_WL (3, 3) of a segment while all joints are at zero; `R_above`: of the segment above."""
-    segment = table.segments[name]
-    R_WK = M_WK[segment.link][:3, :3]
-    if segment.up is not None and segment.forward is not None:
-        return R_WK @ Rotation.from_quat(compute_mount(segment.up, segment.forward)).as_matrix().T
+    """Return R_WL (3, 3) of a segment while all joints are at zero; `R_above`: of the segment above.
+
+    A mechanism's segments have their links' frames, and so have those of a URDF whose links bear the segments' names.
+    Else every segment frame equals W in the N-pose. At zero of its joints a body may stand otherwise, in a T-pose say.
+    There segments of the spine are upright. Others lie along the line between the points of their length, by the
+    shortest rotation of their long axis; a segment without a length is as the segment above.
+    """
+    segment, ends = table.segments[name], table.ends(name)
     if table.is_mechanism or all(each.link == key for key, each in table.segments.items()):
-        return R_WK
-    ends = table.ends(name)
+        return M_WK[segment.link][:3, :3]
     if segment.spine or ends is None or not set(ends[0] + ends[1]) <= set(p_W):
         return np.eye(3) if segment.spine else R_above
     first, last = (np.mean([p_W[point] for point in points], axis=0) for points in ends)
-    along = last - first
-    length = np.linalg.norm(along)
+    along, length = last - first, np.linalg.norm(last - first)
     cosine = float(np.dot(segment.along, along) / max(length, 1e-6))
     if length < 1e-6 or cosine < 1e-6 - 1.0:
         raise BadModel(
             f"{table.where}: segments.{name}: {' and '.join(ends[0] + ends[1])} lie in one place, or opposite to its "
-            f"direction in the N-pose; name other links, or state its up and forward axes of the N-pose"
+            f"direction in the N-pose; name other links"
         )
     return Rotation.from_quat([*np.cross(segment.along, along / length), 1.0 + cosine]).as_matrix()
 
@@ -264,27 +256,26 @@ def _find_triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> tuple[list
 
     Second: their axes (3, 3), a row each, in the frame of the last one's child, all joints at zero.
     """
-    chain = [first]
+    chain, axes = [first], np.zeros((3, 3))
     while len(chain) < 3:
         below, link = tree.below[chain[-1].child], links[chain[-1].child]
         is_heavy = link.inertial is not None and (link.inertial.mass or 0.0) > _LIGHT
         if len(below) != 1 or link.visuals or link.collisions or is_heavy:
             return [], None
         chain.append(below[0])
-    turn = all(joint.type in ("revolute", "continuous") for joint in chain)
-    meet = all(np.linalg.norm(joint.origin[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
-    axes = np.array([joint_axis(joint) for joint in chain])
     for k, joint in enumerate(chain):
         axes[:k] = axes[:k] @ joint.origin[:3, :3]
+        axes[k] = joint_axis(joint)
+    turn = all(joint.type in ("revolute", "continuous") for joint in chain)
+    meet = all(np.linalg.norm(joint.origin[:3, 3]) <= _MEET_TOLERANCE for joint in chain[1:])
     is_triple = turn and meet and np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE
     return (chain, axes) if is_triple else ([], None)
 
 
 def _find_bounds(joint: Any) -> tuple[float, float]:
     """Return the lower and upper limit of a joint [rad or m]; a continuous one has none."""
-    if joint.type == "continuous" or joint.limit is None:
-        return -np.inf, np.inf
-    low, high = joint.limit.lower, joint.limit.upper
+    limit = None if joint.type == "continuous" else joint.limit
+    low, high = getattr(limit, "lower", None), getattr(limit, "upper", None)
     return (-np.inf if low is None else float(low)), (np.inf if high is None else float(high))
 
 
@@ -396,9 +387,8 @@ def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretche
 def _stretch_link(link: Any, S: np.ndarray) -> None:
     """Stretch visuals, collisions and inertia of a link by S (3, 3) in its own coordinates."""
     for visual in [*link.visuals, *link.collisions]:
-        along = np.linalg.norm(S @ visual.origin[:3, :3], axis=0)  # of the visual's own axes
+        geometry, along = visual.geometry, np.linalg.norm(S @ visual.origin[:3, :3], axis=0)  # of the visual's own axes
         visual.origin[:3, 3] = S @ visual.origin[:3, 3]
-        geometry = visual.geometry
         if geometry.box is not None:
             geometry.box.size = np.asarray(geometry.box.size) * along
         elif geometry.cylinder is not None:

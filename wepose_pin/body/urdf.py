@@ -144,23 +144,21 @@ def list_visuals(robot: Any) -> list[Visual]:
     return visuals
 
 
-def reduce_triangles(meshes: list[Mesh]) -> list[Mesh]:
+def reduce_triangles(meshes: list[Mesh], cell: float = FINEST_CELL) -> list[Mesh]:
     """Merge vertices that are near each other until all meshes together have at most `MAX_TRIANGLES`."""
-    cell, reduced = FINEST_CELL, meshes
-    while cell == FINEST_CELL or sum(len(triangles) for _, triangles in reduced) > MAX_TRIANGLES:
-        reduced = [_simplify(*mesh, cell) for mesh in meshes]
-        cell *= CELL_GROWTH
-    return reduced
+    reduced = [_simplify(*mesh, cell) for mesh in meshes]
+    too_many = sum(len(triangles) for _, triangles in reduced) > MAX_TRIANGLES
+    return reduce_triangles(meshes, cell * CELL_GROWTH) if too_many else reduced
 
 
 def triangulate(geometry: Any) -> Mesh:
     """Vertices and triangles of a mesh, box, cylinder or sphere."""
     import trimesh
 
-    kind = type(geometry).__name__
     if hasattr(geometry, "num_tris") and hasattr(geometry, "tri_indices"):
         triangles = [[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))]
         return np.asarray(geometry.vertices(), dtype=float), np.array(triangles, dtype=int).reshape(-1, 3)
+    kind = type(geometry).__name__
     if kind == "Box":
         mesh = trimesh.creation.box(2.0 * np.asarray(geometry.halfSide).ravel())
     elif kind == "Cylinder":
@@ -174,13 +172,11 @@ def triangulate(geometry: Any) -> Mesh:
 
 def _simplify(vertices: np.ndarray, triangles: np.ndarray, cell: float) -> Mesh:
     """Merge the vertices of one cell into their mean; drop triangles that lose a corner."""
-    _, index, count = np.unique(
-        np.round(vertices / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
+    cells = np.round(vertices / cell).astype(np.int64)
+    _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
     mean = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
     corners = index[triangles]
-    whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    corners = corners[whole]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
     _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
     return mean, corners[np.sort(first)]

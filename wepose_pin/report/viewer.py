@@ -137,8 +137,8 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     placed |= compute_placements(robot, trajectory.joint_position[frames], parts, *root)
     trails = {}  # short names: heads are beside them
     for side, arm in arms.items():
-        colour = choose_trail_colour(arm.tip, model)
-        trails[side] = pose.points[arm.tip][nearest], colour
+        colour = choose_trail_colour(arm.points[-1], model)
+        trails[side] = pose.points[arm.points[-1]][nearest], colour
         trails[f"{side}_robot"] = trajectory.hand[side][frames] @ R_WB.T + p_WB, colour
     return view_html(
         visuals,

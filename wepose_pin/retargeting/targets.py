@@ -199,7 +199,7 @@ def compute_arm_targets(
             raise BadData(
                 f"the {arm.side} arm is not known anywhere in the pose: its orientations are missing, or lost"
             )
-        cov = pose.point_cov.get(limb.tip)
+        cov = pose.point_cov.get(limb.points[-1])
         std = np.zeros(len(time)) if cov is None else np.nan_to_num(compute_axis_std(cov), nan=STD_POOR)
         std = np.where(known, std, STD_POOR)
         hands.append(_smooth(time, motion, known, compute_weight(std), arm, smoothing_hz))
