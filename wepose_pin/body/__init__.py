@@ -7,15 +7,14 @@ not travel. Other joints stay as they are.
 
 `table` is what stands on a body, and its file; `tree` the joints and lengths, with links by the table's names in our
 frames; `body` is what they make (`BodyModel`).
-A person's numbers stand in `subject`, those of all people in `anthropometry`; `mounts` finds how sensors are mounted
+A person's numbers stand in `subject`, the lengths of all people in `table`; `mounts` finds how sensors are mounted
 from the start pose. `configuration` solves for joints and points from orientations of segments (`KinematicsSolver`),
 which make a `Pose`; `kinematics` has that, places links and points and says how well they are known.
 """
 
-from .anthropometry import SEXES, convert_breadths, list_breadths
 from .body import BodyModel, load_model
 from .girdle import Girdle
-from .table import DEFAULT_BODY, ROOT, BodyTable, Limb, load_table
+from .table import DEFAULT_BODY, ROOT, SEXES, BodyTable, Limb, convert_breadths, list_breadths, load_table
 from .urdf import Visual
 
 __all__ = [

@@ -15,20 +15,9 @@ import pinocchio as pin
 from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadSession, one_of
-from ..libraries import asset
-from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
-from .table import DEFAULT_BODY, MECHANISM_SEGMENT, BodyTable, Segment, find_table, load_table, read_table
-from .tree import (
-    MOST_LINKS,
-    build,
-    check_joint_values,
-    measure_lengths,
-    measure_reaches,
-    parse_tree,
-    rename_links,
-    stretch_robot,
-)
+from .table import MECHANISM_SEGMENT, BodyTable, Segment, compute_population_lengths, find_table, load_table, read_table
+from .tree import build, check_joint_values, measure_lengths, measure_reaches, parse_tree, rename_links, stretch_robot
 from .urdf import Visual, import_yourdfpy, list_visuals, read_urdf
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
@@ -233,10 +222,10 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str] = (), wh
     Its segments are the links that bear the sensors, as they are; a sensor whose name is no link raises `BadSession`,
     whose text begins with `where`. Parameters and errors else as of `load_model`.
     """
-    default = asset("urdf", f"{DEFAULT_BODY}.urdf")
+    default = Path(load_table().where).with_suffix(".urdf")
     file = Path(path or default)
     if not (file.suffix or file.exists() or len(file.parts) > 1):  # the name of a body of the package
-        file = asset("urdf", f"{load_table(file.name).name}.toml")
+        file = Path(load_table(file.name).where)
     return _load_packaged_body(file) if file.parent == default.parent else _load_body(file, sensors, where)
 
 
@@ -253,8 +242,7 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
     if table is None and sensors:  # a mechanism of the links with sensors
         for name in sensors:
             if name not in tree.below:
-                choices = one_of(tree.below, name, MOST_LINKS)
-                raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
+                raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name)}")
         links = sorted(sensors, key=lambda name: len(tree.path(name)))
         segments = {name: MECHANISM_SEGMENT._replace(link=name, rigid_without_sensor=True) for name in links}
         body = _build_body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(urdf)), str(urdf))
@@ -266,7 +254,7 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
         lacking = [name for name in default.needed if default.segments[name].link not in tree.below]
         raise BadModel(
             f"{urdf}: no link {', '.join(map(repr, lacking))}; name the segments' links in a table, as docs/models.md "
-            f'shows (of a robot with kind = "mechanism"); {one_of(tree.below, most=MOST_LINKS)}'
+            f'shows (of a robot with kind = "mechanism"); {one_of(tree.below, most=100)}'
         )
     # Of a table for several URDFs the names of links fit; joints may have others.
     joints = {joint.name for joint in robot.joints}

@@ -149,9 +149,7 @@ class KinematicsSolver:
 
 
 def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
-    """Find the measured segments that are fitted: of a mechanism all, of a person all of a limb whose joints cannot
-    follow every orientation, and what hangs on such a spine.
-    """
+    """Find the fitted segments: all of a mechanism, of a limb with too few axes, and what hangs on such a spine."""
     if model.table.is_mechanism:
         return list(measured)
     limb: dict[str, str] = {}  # segment → the first of its limb; one of the spine is its own
@@ -319,8 +317,7 @@ def compute_orientation_residuals(
     Only for segments whose orientation the joints cannot reproduce exactly; for all of a mechanism.
     """
     fitted = _find_fitted(model, quat_WL)
-    inexact = (name for name in model.chains if name in fitted or model.find_spherical(name) is None)
-    limited = [name for name in inexact if name in quat_WL]
+    limited = [k for k in model.chains if k in quat_WL and (k in fitted or model.find_spherical(k) is None)]
     R_WL, _ = compute_link_poses(model, q, limited)
     return {
         segment: (Rotation.from_matrix(R_WL[:, k]).inv() * Rotation.from_quat(quat_WL[segment])).magnitude()

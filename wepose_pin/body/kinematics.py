@@ -357,7 +357,8 @@ def compute_point_covariances(
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return {}
-        return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov)
+        lengths_cov = shape_cov[: len(model.lengths), : len(model.lengths)]
+        return _propagate_through_joints(model, q, segment_cov, lengths_cov, points, heading_cov)
     R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
     table, neutral, n = model.table, model.neutral_rotations, len(next(iter(quat_WL.values())))
     lengths, girdles = np.array(list(model.lengths.values())), list(table.girdles)
@@ -418,19 +419,18 @@ def _propagate_through_joints(
     m, data, order = model.pin, model.pin.createData(), list(segment_cov)
     segments, k = [m.getFrameId(segment) for segment in order], len(order)
     frames = [m.getFrameId(model.point_frames[point]) for point in points]
-    cov_W = np.stack(list(segment_cov.values()), axis=1)  # (n, k, 3, 3)
-    shared = np.zeros((len(q), k, k))
-    for (near, far), cov in heading_cov.items():
-        shared[:, order.index(near), order.index(far)] = shared[:, order.index(far), order.index(near)] = cov
+    cov_W = np.zeros((len(q), 3 * k, 3 * k))
+    for i, cov in enumerate(segment_cov.values()):
+        cov_W[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = cov
+    for headings, cov in heading_cov.items():
+        near, far = (3 * order.index(name) + 2 for name in headings)
+        cov_W[:, near, far] = cov_W[:, far, near] = cov
     try:
         reaches = model.reaches if lengths_cov.any() else {}
     except BadModel:  # a joint slides: the way of a point has no constant parts link by link
         return {}
-    ways: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in points]  # views of R_WK, by the lengths
-    for way, point in zip(ways, points, strict=True):
-        for link, (by_length, _) in reaches.get(point, {}).items():
-            frame = data.oMf[m.getFrameId(link)] if m.existFrame(link) else data.oMi[m.getJointId(link)]
-            way.append((frame.rotation, by_length))
+    views = {frame.name: data.oMf[k].rotation for k, frame in enumerate(m.frames)}  # of R_WK
+    views |= {joint: data.oMi[k].rotation for k, joint in enumerate(m.names) if joint not in views}
     out = np.empty((len(points), len(q), 3, 3))
     for row, values in enumerate(np.ascontiguousarray(q)):
         pin.computeJointJacobians(m, data, values)
@@ -439,11 +439,10 @@ def _propagate_through_joints(
         inverse = np.linalg.pinv(J, rcond=1e-6)
         for i, frame in enumerate(frames):
             gain = pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3] @ inverse  # (3, 3 k)
-            parts = gain.reshape(3, k, 3).swapaxes(0, 1)
-            along = np.sum([R_WK @ by_length for R_WK, by_length in ways[i]], axis=0) if ways[i] else np.zeros((3, 0))
-            out[i, row] = np.sum(parts @ cov_W[row] @ parts.swapaxes(1, 2), axis=0)
-            out[i, row] += parts[:, :, 2].T @ shared[row] @ parts[:, :, 2]
-            out[i, row] += along @ lengths_cov[: along.shape[1], : along.shape[1]] @ along.T
+            out[i, row] = gain @ cov_W[row] @ gain.T
+            if way := reaches.get(points[i]):
+                along = np.sum([views[link] @ by_length for link, (by_length, _) in way.items()], axis=0)
+                out[i, row] += along @ lengths_cov @ along.T
     return dict(zip(points, out, strict=True))
 
 

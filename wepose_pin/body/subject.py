@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from ..arguments import NonNegative, Range, check_arguments, check_array, check_fields, check_names
 from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml, toml_string, whole_file
 from ..errors import BadData, BadModel, BadOption, BadSubject
-from .anthropometry import compute_population_lengths
 from .body import BodyModel
 from .girdle import PARAMETERS
 from .soft_tissue import estimate_scatter, make_personal
-from .table import BodyTable, Segment, load_table
+from .table import BodyTable, Segment, compute_population_lengths, load_table
 
 # A row of a covariance, other than lengths.
 _ROW = re.compile(r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law")
@@ -270,7 +269,7 @@ def girdle_rows(table: BodyTable) -> list[str]:
 
 
 def population_subject(
-    stature: float | None = None, sex: str | None = None, body: BodyModel | BodyTable | None = None
+    stature: float | None = None, sex: Literal["f", "m"] | None = None, body: BodyModel | BodyTable | None = None
 ) -> Subject:
     """Return the population prior: the mean lengths of people of this stature and sex, with their covariance.
 

@@ -26,8 +26,6 @@ from ..recording import compute_mount
 from .table import ROOT, BodyTable, Point
 from .urdf import import_yourdfpy
 
-MOST_LINKS = 100  # that an error lists; a person's body has fewer
-
 _FAR = 1e6  # [m]
 _PARALLEL_TOLERANCE = 1e-6
 _MEET_TOLERANCE = 1e-9  # [m]
@@ -113,7 +111,7 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
     places += [(f"points.{name}", point.link) for name, point in table.points.items()]
     for place, link in [*places, *(("root", link) for link in table.root)]:
         if link not in tree.below:
-            raise BadModel(f"{table.where}: {place}: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
+            raise BadModel(f"{table.where}: {place}: no link '{link}'; {one_of(tree.below, link)}")
     M_WM = np.eye(4)  # M: the root link
     M_WM[:3, :3] = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()
     origin = np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
