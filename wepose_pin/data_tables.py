@@ -137,32 +137,29 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
     Raise `UnknownColumn` where a name is not in the table, `BadData` where a column has other values than numbers, or
     its name occurs twice; `file` and `place` (such as ``sensors.torso.gyro``) begin the text.
     """
-    numbers = [_read_numbers(table, name, file, place) for name in names]
-    return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
-
-
-def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.Series:
-    if name not in table.columns:
-        raise UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
-    if f"{name}_duplicated_0" in table.columns:
-        raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
-    series = table[name]
-    holds = f"{file}: column '{name}' holds"
-    if series.dtype == pl.String:
-        stripped = series.str.strip_chars()
-        series = stripped.cast(pl.Float64, strict=False)
-        bad = series.is_null() & stripped.is_not_null() & ~stripped.is_in(NO_VALUE)
-        if bad.any():
-            text = stripped[row := int(bad.arg_max() or 0)]
-            numeric = re.fullmatch(r"-?(\d+,\d*|,\d+)", text)
-            right = f"write decimals with a point: {text.replace(',', '.')}" if numeric else "it must be a number"
-            raise BadData(f"{holds} text in row {row + 1}: '{text[:40]}'; {right}")
-    elif not series.dtype.is_numeric() and series.dtype != pl.Null:
-        raise BadData(f"{holds} values of type {series.dtype}; it must hold numbers")
-    numbers = series.cast(pl.Float64)
-    if numbers.is_infinite().any():
-        raise BadData(f"{holds} inf in row {int(numbers.is_infinite().arg_max() or 0) + 1}; it must be a number")
-    return numbers.fill_null(float("nan")).rename(name)
+    columns = []
+    for name in names:
+        if name not in table.columns:
+            raise UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
+        if f"{name}_duplicated_0" in table.columns:
+            raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
+        series, holds = table[name], f"{file}: column '{name}' holds"
+        if series.dtype == pl.String:
+            stripped = series.str.strip_chars()
+            series = stripped.cast(pl.Float64, strict=False)
+            bad = series.is_null() & stripped.is_not_null() & ~stripped.is_in(NO_VALUE)
+            if bad.any():
+                text = stripped[row := int(bad.arg_max() or 0)]
+                numeric = re.fullmatch(r"-?(\d+,\d*|,\d+)", text)
+                right = f"write decimals with a point: {text.replace(',', '.')}" if numeric else "it must be a number"
+                raise BadData(f"{holds} text in row {row + 1}: '{text[:40]}'; {right}")
+        elif not series.dtype.is_numeric() and series.dtype != pl.Null:
+            raise BadData(f"{holds} values of type {series.dtype}; it must hold numbers")
+        numbers = series.cast(pl.Float64)
+        if numbers.is_infinite().any():
+            raise BadData(f"{holds} inf in row {int(numbers.is_infinite().arg_max() or 0) + 1}; it must be a number")
+        columns.append(numbers.fill_null(float("nan")).rename(name))
+    return np.ascontiguousarray(pl.DataFrame(columns).to_numpy().reshape(table.height, len(names)))
 
 
 def _is_parquet(path: Path) -> bool:

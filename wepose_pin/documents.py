@@ -83,17 +83,17 @@ class TomlTable:
         return [replace(self, values=each, place=f"{self.place}{key} {k + 1}.") for k, each in enumerate(value)]
 
     def get(self, key: str, default: Any, hint: Any) -> Any:
-        """Return a value that its annotation takes; `default` where the key is missing."""
+        """Return a value that its annotation takes, no empty text; `default` where the key is missing."""
         value = self.values.get(key, default)
         if value is not None:
             check_value(self.at(key), value, hint, self.error)
+        if value != default and "" in (value if isinstance(value, list) else [value]):
+            raise self.error(f"{self.at(key)} is empty; write a text, or leave it out")
         return value
 
     def text(self, key: str, default: str | None) -> str | None:
         """Return a text that is not empty; `default` where the key is missing."""
         value: str | None = self.get(key, default, str)
-        if value == "" != default:
-            raise self.error(f"{self.at(key)} is empty; write a text, or leave it out")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
@@ -241,10 +241,8 @@ def _read_value(hint: Any, table: TomlTable, key: Key, known: Mapping[str, Colle
         raise table.error(f"{table.at(key.name)} is missing; {needed}")
     if isinstance(value, str) and str in parts and get_origin(hint) is tuple:
         value = [value]  # one name in place of a list
-    check_value(table.at(key.name), value, hint, table.error)
+    replace(table, values={key.name: value}).get(key.name, None, hint)
     for text in value if isinstance(value, list) else [value]:
-        if text == "":
-            raise table.error(f"{table.at(key.name)} is empty; write a text, or leave it out")
         if names and text not in names:
             raise table.error(f"{table.at(key.name)} = '{text}' is not known; {one_of(names, text)}")
     return key.words[str(value)] if key.words else _convert(value, key)

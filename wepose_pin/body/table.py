@@ -25,7 +25,7 @@ from .girdle import Direction, Girdle, SegmentName
 DEFAULT_BODY = "upper_body"
 ROOT = "root"  # the origin of W, as the end of a length
 NEUTRAL_POSE = "n_pose"
-SEXES = ("f", "m")
+SEXES: tuple[Literal["f", "m"], ...] = ("f", "m")
 PRIOR = "calibration", "anthropometry.toml"  # mean and covariance of the lengths of people, from shares of stature
 # Regular expressions of the side in a sensor's name, in English and German.
 _SIDES = {"left": "left|lt?|link(s|e[rsmn]?)", "right": "right|rt?|recht(s|e[rsmn]?)"}
