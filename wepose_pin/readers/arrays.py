@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,53 +30,46 @@ def is_array_file(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-@dataclass
 class ArrayFile:
-    """The arrays of numbers in a file; those of an HDF5 file are read on demand."""
+    """The arrays of numbers in a file, with their `shapes` by path; those of an HDF5 file are read on demand."""
 
-    path: Path
-    shapes: dict[str, tuple[int, ...]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        check_file(self.path, KIND)
-        with library_errors(self.path, KIND), self.path.open("rb") as file:
+    def __init__(self, path: Path) -> None:
+        check_file(path, KIND)
+        with library_errors(path, KIND), path.open("rb") as file:
             start = file.read(520)
+        self.path, self.shapes = path, dict[str, tuple[int, ...]]()
         self._loaded: dict[str, np.ndarray] = {}
         if HDF5_MAGIC in (start[:8], start[512:]):  # MATLAB puts 512 bytes of its own before it
-            self._hdf5 = import_library("h5py", self.path, "HDF5 (MATLAB's v7.3 is too)")
-            self.shapes = {}
-
-            def visit(name: str, node: Any) -> None:
-                dtype = getattr(node, "dtype", None)  # a group has none
-                if dtype is not None and dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
-                    self.shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
-
-            with library_errors(self.path, KIND), self._hdf5.File(self.path) as file:
-                file.visititems(visit)
+            self._hdf5 = import_library("h5py", path, "HDF5 (MATLAB's v7.3 is too)")
+            with library_errors(path, KIND), self._hdf5.File(path) as content:
+                content.visititems(self._add_shape)
         else:
-            self._loaded = {name: values for name, values in read_mat(self.path).items() if values.ndim}
+            self._loaded = {name: values for name, values in read_mat(path).items() if values.ndim}
             self.shapes = {name: values.shape for name, values in self._loaded.items()}
         if not self.shapes:
-            raise BadData(f"{self.path}: no arrays of numbers in it")
+            raise BadData(f"{path}: no arrays of numbers in it")
 
-    def table(self, wanted: Mapping[str, str]) -> pl.DataFrame:
-        """Read columns by name, ``path`` of an array or ``path[k]``; `wanted` is name → what begins an error."""
+    def _add_shape(self, name: str, node: Any) -> None:
+        dtype = getattr(node, "dtype", None)  # a group has none
+        if dtype is not None and dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
+            self.shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
+
+    def table(self, places: Mapping[str, str]) -> pl.DataFrame:
+        """Read columns by name, ``path`` of an array or ``path[k]``; `places`: name → what begins an error's text."""
         columns = {}
-        for name, place in wanted.items():
+        for name, place in places.items():
             part = re.fullmatch(r"(.*)\[(\d+)\]", name)
-            array = part[1] if part else name
+            array, k = (part[1], int(part[2])) if part else (name, 0)
             values = self._read_array(self._find(array, place))
             if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
                 values = values.T  # MATLAB's v7.3 transposes arrays
             values = values.reshape(len(values), -1)
-            k = int(part[2]) if part else 0
             if k >= values.shape[1] or (part is None and values.shape[1] > 1):
                 shape = f"one column of {self.path.name}, whose {array} has shape {values.shape}"
                 raise UnknownColumn(f"{place}: {name} is not {shape}; name one as {array}[0]")
             columns[name] = np.ascontiguousarray(values[:, k])
-        lengths = {name: len(values) for name, values in columns.items()}
-        if len(set(lengths.values())) > 1:
-            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        if len({len(values) for values in columns.values()}) > 1:
+            listed = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
             raise BadData(f"{self.path}: the arrays of a sensor and its time differ in length: {listed}")
         return pl.DataFrame(columns)
 
@@ -107,18 +99,16 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
     Path → array (n,) or (n, k), or a single number, (). What is neither a number nor a struct of one element is passed
     over.
     """
-    arrays: dict[str, np.ndarray] = {}
-
-    def visit(place: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for name, part in value.items():
-                visit(f"{place}/{name}", part)
-        elif isinstance(value, int | float | np.ndarray):
-            array = np.asarray(value)
-            if array.dtype.kind in "biuf" and array.ndim <= 2:
-                arrays[place] = array.astype(float)
-
     with library_errors(path, KIND):
         content = loadmat(path, simplify_cells=True)
-    visit("", {name: value for name, value in content.items() if not name.startswith("__")})
+    arrays: dict[str, np.ndarray] = {}
+    waiting = [(f"/{name}", value) for name, value in reversed(content.items()) if not name.startswith("__")]
+    while waiting:
+        place, value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += [(f"{place}/{name}", part) for name, part in reversed(value.items())]
+        elif isinstance(value, int | float | np.ndarray) and np.ndim(value) <= 2:
+            array = np.asarray(value)
+            if array.dtype.kind in "biuf":
+                arrays[place] = array.astype(float)
     return arrays

@@ -23,18 +23,9 @@ from ..data_tables import read_columns, read_first_lines, read_names, read_table
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
-from ..recording import (
-    AXES,
-    CONFIGURATION,
-    ImuSensor,
-    Intervals,
-    Recording,
-    compute_rate,
-    find_runs,
-    format_span,
-    format_time,
-)
+from ..recording import AXES, CONFIGURATION, ImuSensor, Recording, compute_rate
 from ..recording.clocks import TIME_UNITS, guess_time_unit
+from ..recording.intervals import Intervals, find_runs, format_span, format_time
 from ..recording.limits import LONGEST_STEP_S
 from .arrays import ArrayFile, is_array_file
 from .device import Device

@@ -47,7 +47,7 @@ def guess_columns(
     """
     names = list(names)
     own_units = {name: (units or {}).get(name, "") or split_unit(name)[1] for name in names}
-    return _make_guess(names, group_columns(names, table), own_units)
+    return _make_guess({name: name for name in names}, group_columns(names, table), own_units)
 
 
 def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None = None) -> Guess:
@@ -58,27 +58,25 @@ def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None 
         if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
             by_sensor.setdefault(_find_owner(path, table or load_table()), {}).setdefault(signal, [path])
     vectors = (path for path, shape in shapes.items() if max(shape, default=0) == math.prod(shape))
-    times = {path.rpartition("/")[2]: path for path in vectors}
-    guess = _make_guess(list(times), by_sensor, {})
-    units = {times.get(name, name): unit for name, unit in guess.units.items()}
-    return guess._replace(times=[times[name] for name in guess.times], units=units)
+    return _make_guess({path.rpartition("/")[2]: path for path in vectors}, by_sensor, {})
 
 
 def _make_guess(
-    names: Sequence[str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
+    columns: Mapping[str, str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
 ) -> Guess:
+    """Make the guess; `columns`: name → column or array of those that may be times."""
     sensors: dict[str, Mapping[str, list[str]]] = {}
     units: dict[str, str | None] = {}
-    for name, signals in by_sensor.items():
+    for owner, signals in by_sensor.items():
         needed = ("gyro", "accel") if {"gyro", "accel"} <= set(signals) else ("orientation",)
         if set(needed) <= set(signals):
-            sensors[name] = {signal: signals[signal] for signal in signals if signal in needed}
+            sensors[owner] = {signal: signals[signal] for signal in signals if signal in needed}
             units |= {signal: guess_unit(signal, own_units.get(signals[signal][0], "")) for signal in needed}
-    times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
-    for name in times:
+    times = {name: each for name, each in columns.items() if _is_time(split_unit(name)[0]) or _is_time(name)}
+    for name, each in times.items():
         words = [own_units.get(name, "").lower(), *_split_words(name)]
-        units[name] = next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None)
-    return Guess(times, sensors, {name: unit for name, unit in units.items() if unit})
+        units[each] = next((TIME_UNIT[word] for word in words if word in TIME_UNIT), None)
+    return Guess(list(times.values()), sensors, {name: unit for name, unit in units.items() if unit})
 
 
 def group_columns(names: Sequence[str], table: BodyTable | None = None) -> dict[str, dict[str, list[str]]]:

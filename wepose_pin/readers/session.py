@@ -20,33 +20,17 @@ from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printab
 from ..recording import (
     CONFIGURATION,
     ImuSensor,
-    Intervals,
     OrientationSensor,
     Recording,
     Sensor,
-    check_phases,
     check_recording,
+    clocks,
     compute_mount,
-    find_runs,
-    format_span,
     read_axes,
 )
-from ..recording.clocks import (
-    BRIDGED,
-    GOOD,
-    LONG,
-    LONGEST_GAP_S,
-    TIME_UNITS,
-    Clock,
-    bridge,
-    bridge_quat,
-    build_clock,
-    find_common_time,
-    mark_lost_samples,
-    measure_rate,
-    resample,
-)
+from ..recording.clocks import TIME_UNITS, Clock
 from ..recording.faults import Fault, check_sensors
+from ..recording.intervals import Intervals, check_phases, find_runs, format_span
 from ..recording.plausibility import check_signals
 from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device, check_measured
@@ -247,7 +231,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     # Clocks that start at power-on are shifted together, so that the earliest begins at zero.
     power_on_s = min((each.begin for each in devices.values() if each.since_power_on), default=0.0)
     alike = len({bool(each.signals) for each in keys.values()}) == 1
-    clocks: dict[str, Clock] = {}  # of each sensor, with lost rows filled in
+    own_clocks: dict[str, Clock] = {}  # of each sensor, with lost rows filled in
     rows: dict[str, Sensor] = {}  # as its file has them, without lost rows
     for name, each in keys.items():
         unused = OF_FORMATS if each.signals else OF_COLUMNS
@@ -255,30 +239,34 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
             why = "the columns are named here" if each.signals else "the format of the file defines it"
             raise BadSession(f"{own.at(key)} has no effect, as {why}; remove it")
         if each.signals:
-            clocks[name], rows[name] = _read_sensor(each, contents)
+            own_clocks[name], rows[name] = _read_sensor(each, contents)
         else:
-            clocks[name], rows[name] = _take_sensor(name, each, devices[name], power_on_s, contents)
+            own_clocks[name], rows[name] = _take_sensor(name, each, devices[name], power_on_s, contents)
     places = {name: f"{each.path}: {each.table.place}" for name, each in keys.items()}
     diagnostics = [own for content in contents.values() for own in getattr(content, "diagnostics", ())]
-    packets = {id(clock): (keys[name].path.name, clock.packet) for name, clock in clocks.items() if clock.packet > 1}
+    packets = {
+        id(clock): (keys[name].path.name, clock.packet) for name, clock in own_clocks.items() if clock.packet > 1
+    }
     for file, size in packets.values():
         facts: dict[str, float | str] = {"variant": "packets", "packet": size}
         diagnostics.append(Diagnostic("time-stamps-uneven", INFO, file, facts=facts))
     del contents  # of a day its tables are gigabytes
-    time, resampled = find_common_time(str(path), clocks)
+    time, resampled = clocks.find_common_time(str(path), own_clocks)
     check_phases(str(path), time, head.phases)
     start = next(iter(head.phases.get("start", ())), None)
-    samples = {name: (clock.time[clock.row >= 0], *_signals(rows[name]).values()) for name, clock in clocks.items()}
+    samples = {name: (clock.time[clock.row >= 0], *_signals(rows[name]).values()) for name, clock in own_clocks.items()}
     faults, gyro_range, frozen = check_sensors(str(path), samples, start)
     sensors: dict[str, Sensor] = {}
     diagnostics = [*resampled, *diagnostics, *frozen]
-    for segment, clock in clocks.items():
+    for segment, clock in own_clocks.items():
         sensor, marks = _bridge_gaps(places[segment], rows[segment], clock, faults.get(segment, []), gaps)
         if isinstance(sensor, ImuSensor):
             sensor = replace(sensor, gyro_range=gyro_range[segment])
-        sensors[segment] = resample(sensor, clock.time, time) if resampled else sensor
+        sensors[segment] = clocks.resample(sensor, clock.time, time) if resampled else sensor
         diagnostics += _report_bridged_gaps(segment, marks, clock.step)
-    recording = replace(head, time=time, rate_hz=measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics))
+    recording = replace(
+        head, time=time, rate_hz=clocks.measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics)
+    )
     check_recording(recording)
     return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
 
@@ -320,7 +308,7 @@ def _take_sensor(
         raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
     sensor = device.sensors[labels[0]]
     offset_s = keys.offset_s - (power_on_s if device.since_power_on else 0.0)
-    clock = _once(contents, (path, id(sensor.time), offset_s), build_clock, sensor.time + offset_s, str(path))
+    clock = _once(contents, (path, id(sensor.time), offset_s), clocks.build_clock, sensor.time + offset_s, str(path))
     mount = sensor.mount if keys.mount is None else keys.mount
     aligned = device.aligned if keys.aligned is None else keys.aligned
     return clock, _make_sensor(keys._replace(mount=mount, aligned=aligned), sensor.signals)
@@ -353,7 +341,7 @@ def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sen
         time, source = read_columns(content, [keys.time], str(path), keys.at("time"))[:, 0], str(path)
         time = TIME_UNITS[keys.time_unit] * time
     key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
-    clock = _once(contents, key, build_clock, time + keys.offset_s, source)
+    clock = _once(contents, key, clocks.build_clock, time + keys.offset_s, source)
     signals = {}
     for signal, names in columns.items():
         signals[signal] = units[signal] * read_columns(content, names, str(path), table.at(signal))
@@ -387,7 +375,7 @@ def _bridge_gaps(
         signals[signal], good = _place_on_clock(rows, clock, f"{place}{signal}", signal == "orientation")
         if not good.any():
             raise BadData(f"{place}{signal}: no numbers from {format_span(clock.time[[0, -1]])}")
-        if not gaps and (long := find_runs(mark_lost_samples(clock, good) == LONG)):
+        if not gaps and (long := find_runs(clocks.mark_lost_samples(clock, good) == clocks.LONG)):
             first, last = long[0]
             lost_s, row = (last - first) * clock.step, clock.row[:first].max(initial=-1) + 1
             raise BadData(
@@ -395,13 +383,15 @@ def _bridge_gaps(
                 f"{row}; up to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
             )
         lost |= ~good
-    marks = mark_lost_samples(clock, ~lost)
+    marks = clocks.mark_lost_samples(clock, ~lost)
     bridged: dict[str, Any] = {
-        _FIELDS[signal]: (bridge_quat if signal == "orientation" else bridge)(values, marks, clock)
+        _FIELDS[signal]: (clocks.bridge_quat if signal == "orientation" else clocks.bridge)(values, marks, clock)
         for signal, values in signals.items()
     }
-    bridged["gap"] = marks == LONG if gaps or faults else None
-    return replace(sensor, **bridged), np.where(frozen, GOOD, marks)  # frozen samples have a diagnostic of their own
+    bridged["gap"] = marks == clocks.LONG if gaps or faults else None
+    return replace(sensor, **bridged), np.where(
+        frozen, clocks.GOOD, marks
+    )  # frozen samples have a diagnostic of their own
 
 
 def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -424,10 +414,10 @@ def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -
 
 def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
     """Report bridged gaps, short ones where they are many, from the marks (n,) of the samples and their step [s]."""
-    long, short = ([last - first for first, last in find_runs(marks == mark)] for mark in (LONG, BRIDGED))
+    long, short = ([last - first for first, last in find_runs(marks == mark)] for mark in (clocks.LONG, clocks.BRIDGED))
     if long:
         facts: dict[str, float | str] = {"samples": sum(long), "gaps": len(long)}
-        yield Diagnostic("samples-lost", WARNING, segment, max(long) * step, max(LONGEST_GAP_S, step), facts)
+        yield Diagnostic("samples-lost", WARNING, segment, max(long) * step, max(clocks.LONGEST_GAP_S, step), facts)
     elif sum(short) > MOST_LOST * len(marks):
         facts = {"variant": "short", "longest": max(short) * step}
         yield Diagnostic("samples-lost", WARNING, segment, sum(short) / len(marks), MOST_LOST, facts)

@@ -23,16 +23,7 @@ from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .joints import write_lerobot, write_mcap, write_rosbag, write_rrd
-from .motion import (
-    ROBOT_URDF,
-    TRAJECTORY,
-    HasJointMotion,
-    check_rate,
-    convert_person,
-    read_joint_motion,
-    resample,
-    resample_joints,
-)
+from .motion import ROBOT_URDF, TRAJECTORY, HasJointMotion, check_rate, convert_person, read_joint_motion, resample
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import data_folder
 from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
@@ -232,7 +223,7 @@ def _read_motion(
             raise BadOption(f"--format {format}: {result} is a robot's trajectory, for {others}")
         robot = result.joint_motion() if isinstance(result, HasJointMotion) else read_joint_motion(Path(str(result)))
         robot = robot.select(interval, phase)
-        return robot if rate_hz is None else resample_joints(robot, rate_hz)
+        return robot if rate_hz is None else robot.resample(rate_hz)
     if of == ROBOTS:
         raise BadOption(f"--format {format}: is of robots, as `wepose retarget` writes them; {result} is none")
     motion = result if isinstance(result, TrackResult) else load_result(Path(str(result)))

@@ -15,20 +15,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import polars as pl
+from scipy.spatial.transform import Rotation
 
 from ..body.urdf import Mesh, package_folders, reduce_triangles, triangulate
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption, WrongOption, native_stderr_muted, one_of
 from ..libraries import import_library
-from .motion import (
-    REPETITIONS,
-    ROBOT_URDF,
-    JointMotion,
-    LinkTransform,
-    compute_link_poses_W,
-    compute_link_transforms,
-    is_even,
-)
+from ..rotations import multiply
+from .motion import REPETITIONS, ROBOT_URDF, JointMotion, LinkTransform, compute_link_transforms, is_even
 from .result import write_table
 
 # ROS 2 ---------------------------------------------------------------------------------------------------------------
@@ -129,7 +123,7 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     recording.save(path)
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     index = [rr.TimeColumn("time", duration=motion.time)]
-    for link, (quat, p) in compute_link_poses_W(motion).items():
+    for link, (quat, p) in _compute_link_poses_W(motion).items():
         entity = f"body/{rr.escape_entity_path_part(link)}"
         if np.ptp(p, axis=0).any() or np.ptp(quat, axis=0).any():
             columns = rr.Transform3D.columns(translation=p, quaternion=quat)
@@ -145,6 +139,17 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
         recording.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=motion.values(joint)))
     recording.flush()
     recording.disconnect()
+
+
+def _compute_link_poses_W(motion: JointMotion) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Compute xyzw (n, 4) and [m] (n, 3) of every link in W, parents before children."""
+    n = len(motion.time)
+    poses = {motion.root: (np.tile(motion.quat_WB, (n, 1)), np.tile(motion.p_WB, (n, 1)))}
+    for link, (parent, quat, p) in compute_link_transforms(motion).items():
+        quat_WP, p_WP = poses[parent]
+        offset = Rotation.from_quat(quat_WP).apply(np.array(np.broadcast_to(p, (n, 3))))
+        poses[link] = (multiply(quat_WP, np.broadcast_to(quat, (n, 4))), p_WP + offset)
+    return poses
 
 
 def _load_meshes(motion: JointMotion) -> list[tuple[str, Mesh, np.ndarray]]:

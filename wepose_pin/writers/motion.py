@@ -192,6 +192,19 @@ class JointMotion:
             raise BadData(f"{self.where}: follows no {selected[0]:g} to {selected[1]:g} s of the recording")
         return part
 
+    def resample(self, rate_hz: float) -> JointMotion:
+        """Return the motion at another rate, on the cubics through positions and velocities."""
+        time = make_times(self.time, rate_hz)
+        curve, inside = CubicHermiteSpline(self.time, self.position, self.velocity), np.minimum(time, self.time[-1])
+        return replace(
+            self,
+            time=time,
+            position=curve(inside),
+            velocity=curve.derivative()(inside),
+            recorded_time=np.interp(inside, self.time, self.recorded_time),
+            begin=int(np.searchsorted(time, self.time[min(self.begin, len(self.time) - 1)] - SLACK_S)),
+        )
+
 
 @runtime_checkable
 class HasJointMotion(Protocol):
@@ -233,17 +246,6 @@ def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
     return transforms
 
 
-def compute_link_poses_W(motion: JointMotion) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Compute xyzw (n, 4) and [m] (n, 3) of every link in W, parents before children."""
-    n = len(motion.time)
-    poses = {motion.root: (np.tile(motion.quat_WB, (n, 1)), np.tile(motion.p_WB, (n, 1)))}
-    for link, (parent, quat, p) in compute_link_transforms(motion).items():
-        quat_WP, p_WP = poses[parent]
-        offset = Rotation.from_quat(quat_WP).apply(np.array(np.broadcast_to(p, (n, 3))))
-        poses[link] = (multiply(quat_WP, np.broadcast_to(quat, (n, 4))), p_WP + offset)
-    return poses
-
-
 # Of a robot ----------------------------------------------------------------------------------------------------------
 
 
@@ -283,21 +285,6 @@ def read_joint_motion(folder: Path) -> JointMotion:
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
         source=source,
         no_repetitions=str(repetitions.get("reason") or ""),
-    )
-
-
-def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
-    """Return the motion at another rate, on the cubics through positions and velocities."""
-    time = make_times(motion.time, rate_hz)
-    curve = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
-    inside = np.minimum(time, motion.time[-1])
-    return replace(
-        motion,
-        time=time,
-        position=curve(inside),
-        velocity=curve.derivative()(inside),
-        recorded_time=np.interp(inside, motion.time, motion.recorded_time),
-        begin=int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S)),
     )
 
 
