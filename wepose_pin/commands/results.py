@@ -131,7 +131,7 @@ def evaluate(
     from ..evaluation import evaluate as compare
     from ..evaluation import register
     from ..readers import load_session
-    from ..readers.reference import is_reference, read_reference
+    from ..readers.reference import SUFFIXES, read_reference
     from ..recording import select_interval
     from ..writers import load_result
 
@@ -146,7 +146,7 @@ def evaluate(
         if file is None:
             raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
         up, diagnostics = None, tuple[Diagnostic, ...]()
-        if is_reference(file):
+        if file.suffix.lower() in SUFFIXES:
             measured = read_reference(file, markers)
             reference = Pose(measured.time, measured.quat_VT, measured.points)
             up, diagnostics = measured.up, measured.diagnostics

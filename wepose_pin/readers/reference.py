@@ -21,17 +21,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..data_tables import read_body, read_first_lines
+from ..data_tables import parse_rows, read_body, read_columns, read_first_lines
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, one_of
 from ..libraries import check_file, import_library, library_errors
 from .device import Reference, check_measured
 from .mvnx import read_mvnx_reference
 
-SUFFIXES = (".c3d", ".trc", ".mvnx")
+SUFFIXES = (".c3d", ".trc", ".mvnx")  # of files of other systems; others have the columns of pose.parquet
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "millimeters": 1e-3}
 # The axes of a segment's frame (x forward, y left, z up in the N-pose) that a direction is of.
 DIRECTIONS = {"up": "z", "left": "y", "forward": "x", "lateral": "y"}
@@ -41,11 +40,6 @@ _FORMS = {
     "segments": '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions',
     "rotations": "the name of a rotation",
 }
-
-
-def is_reference(path: Path) -> bool:
-    """Return whether a file is that of another system, by its name; not a table with the columns of pose.parquet."""
-    return path.suffix.lower() in SUFFIXES
 
 
 def read_reference(path: Path, markers: Path | None = None) -> Reference:
@@ -138,15 +132,11 @@ def _read_trc(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     names = [name.strip() for name in lines[3].split("\t")[2:] if name.strip()]
     if not names or len(set(names)) < len(names):
         raise BadData(f"{path}: line 4 names {'no markers' if not names else 'a marker twice'}: {lines[3][:60]!r}")
-    columns = [str(k) for k in range(2 + 3 * len(names))]
-    with library_errors(path, "a TRC"):
-        schema = dict.fromkeys([*columns, "end"], pl.String)  # a tab may end each row
-        body = read_body(path, 5)
-        cells = pl.read_csv(body, has_header=False, separator="\t", schema=schema, missing_columns="insert")
-        cells = cells.select(pl.all().str.strip_chars().replace("", None)).drop_nulls("1")
-        if cells["end"].count():
-            raise BadData(f"{path}: a row has more than the {len(columns)} cells of {len(names)} markers")
-        rows = cells.select(columns).cast(pl.Float64).to_numpy()
+    columns = ["Frame#", "Time", *(f"{name} {axis}" for name in names for axis in "XYZ")]
+    table = parse_rows(path, read_body(path, 5), [*columns, "end"], "\t").drop_nulls("Time")  # a tab may end each row
+    if table["end"].count():
+        raise BadData(f"{path}: a row has more than the {len(columns)} cells of {len(names)} markers")
+    rows = read_columns(table, columns, str(path), str(path))
     if len(rows) < 2 or not np.all(np.diff(rows[:, 1]) > 0.0):
         problem = "the times of its rows do not increase" if len(rows) > 1 else f"{len(rows)} rows of markers"
         raise BadData(f"{path}: {problem}; a recording has at least 2 rows, and time grows")

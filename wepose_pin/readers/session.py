@@ -47,7 +47,6 @@ _RENAMED_PHASES = {
 OF_FORMATS = ("format", "label", "use")
 OF_COLUMNS = ("gyro_unit", "accel_unit", "time", "time_unit")
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
-_FIELDS = {"gyro": "gyro_S", "accel": "accel_S", "orientation": "quat_VS"}  # signal → field of a `Sensor`
 NORM_ERROR = 1e-2  # of a quaternion, from rounded decimals
 MOST_LOST = 0.01  # share of samples lost in short gaps, above which it is a diagnostic
 _UNITS = {"time_unit": TIME_UNITS, "gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}
@@ -232,21 +231,22 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     power_on_s = min((each.begin for each in devices.values() if each.since_power_on), default=0.0)
     alike = len({bool(each.signals) for each in keys.values()}) == 1
     own_clocks: dict[str, Clock] = {}  # of each sensor, with lost rows filled in
-    rows: dict[str, Sensor] = {}  # as its file has them, without lost rows
+    rows: dict[str, Mapping[str, np.ndarray]] = {}  # its signals in SI, as its file has them, without lost rows
     for name, each in keys.items():
         unused = OF_FORMATS if each.signals else OF_COLUMNS
         for key, own in ((key, own) for own in (each.table, *[data] * alike) for key in unused if key in own):
             why = "the columns are named here" if each.signals else "the format of the file defines it"
             raise BadSession(f"{own.at(key)} has no effect, as {why}; remove it")
         if each.signals:
-            own_clocks[name], rows[name] = _read_sensor(each, contents)
+            own_clocks[name], rows[name] = _read_columns(each, contents)
         else:
-            own_clocks[name], rows[name] = _take_sensor(name, each, devices[name], power_on_s, contents)
-    places = {name: f"{each.path}: {each.table.place}" for name, each in keys.items()}
+            keys[name], own_clocks[name], rows[name] = _take_sensor(name, each, devices[name], power_on_s, contents)
+        if keys[name].aligned and ("mount" in each.table or "orientation" not in rows[name]):
+            raise BadSession(
+                f"{each.table.where}: aligned orientations are the segment's own: no mount, and no raw data"
+            )
     diagnostics = [own for content in contents.values() for own in getattr(content, "diagnostics", ())]
-    packets = {
-        id(clock): (keys[name].path.name, clock.packet) for name, clock in own_clocks.items() if clock.packet > 1
-    }
+    packets = {id(each): (keys[name].path.name, each.packet) for name, each in own_clocks.items() if each.packet > 1}
     for file, size in packets.values():
         facts: dict[str, float | str] = {"variant": "packets", "packet": size}
         diagnostics.append(Diagnostic("time-stamps-uneven", INFO, file, facts=facts))
@@ -254,25 +254,24 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     time, resampled = clocks.find_common_time(str(path), own_clocks)
     check_phases(str(path), time, head.phases)
     start = next(iter(head.phases.get("start", ())), None)
-    samples = {name: (clock.time[clock.row >= 0], *_signals(rows[name]).values()) for name, clock in own_clocks.items()}
+    samples = {name: (clock.time[clock.row >= 0], *rows[name].values()) for name, clock in own_clocks.items()}
     faults, gyro_range, frozen = check_sensors(str(path), samples, start)
     sensors: dict[str, Sensor] = {}
     diagnostics = [*resampled, *diagnostics, *frozen]
     for segment, clock in own_clocks.items():
-        sensor, marks = _bridge_gaps(places[segment], rows[segment], clock, faults.get(segment, []), gaps)
-        if isinstance(sensor, ImuSensor):
-            sensor = replace(sensor, gyro_range=gyro_range[segment])
+        each = keys[segment]
+        place, own_faults = f"{each.path}: {each.table.place}", faults.get(segment, [])
+        signals, gap, marks = _bridge_gaps(place, rows[segment], clock, own_faults, gaps)
+        if "orientation" in signals:
+            sensor: Sensor = OrientationSensor(signals["orientation"], each.mount, gap, bool(each.aligned))
+        else:
+            sensor = ImuSensor(signals["gyro"], signals["accel"], each.mount, gap, gyro_range[segment])
         sensors[segment] = clocks.resample(sensor, clock.time, time) if resampled else sensor
         diagnostics += _report_bridged_gaps(segment, marks, clock.step)
-    recording = replace(
-        head, time=time, rate_hz=clocks.measure_rate(time), sensors=sensors, diagnostics=tuple(diagnostics)
-    )
+    rate_hz = clocks.measure_rate(time)
+    recording = replace(head, time=time, rate_hz=rate_hz, sensors=sensors, diagnostics=tuple(diagnostics))
     check_recording(recording)
     return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
-
-
-def _signals(sensor: Sensor) -> dict[str, np.ndarray]:
-    return {signal: getattr(sensor, name) for signal, name in _FIELDS.items() if hasattr(sensor, name)}
 
 
 def _once(contents: dict[Any, Any], key: Any, read: Callable[..., T], *arguments: Any) -> T:
@@ -298,8 +297,11 @@ def _open_device(keys: SensorKeys, contents: dict[Any, Any]) -> Device:
 
 def _take_sensor(
     segment: str, keys: SensorKeys, device: Device, power_on_s: float, contents: dict[Any, Any]
-) -> tuple[Clock, Sensor]:
-    """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor."""
+) -> tuple[SensorKeys, Clock, Mapping[str, np.ndarray]]:
+    """Take a sensor of a device's file: the stated label, the one with the segment's name, or the only sensor.
+
+    Returns its keys, with the device's mount and `aligned` where these are not stated, its clock and its signals.
+    """
     path, table = keys.path, keys.table
     labels = [label for label, each in device.sensors.items() if each.segment == segment] or list(device.sensors)
     if keys.label:
@@ -311,10 +313,10 @@ def _take_sensor(
     clock = _once(contents, (path, id(sensor.time), offset_s), clocks.build_clock, sensor.time + offset_s, str(path))
     mount = sensor.mount if keys.mount is None else keys.mount
     aligned = device.aligned if keys.aligned is None else keys.aligned
-    return clock, _make_sensor(keys._replace(mount=mount, aligned=aligned), sensor.signals)
+    return keys._replace(mount=mount, aligned=aligned), clock, sensor.signals
 
 
-def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sensor]:
+def _read_columns(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Mapping[str, np.ndarray]]:
     """Read the columns or arrays of a sensor, which the session names."""
     path, table = keys.path, keys.table
     if bool(keys.time) == (keys.rate_hz is not None):
@@ -347,32 +349,23 @@ def _read_sensor(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Sen
         signals[signal] = units[signal] * read_columns(content, names, str(path), table.at(signal))
         if is_table:  # columns that have been read make room: of a day the table is gigabytes
             contents[path] = contents[path].with_columns(pl.lit(None).alias(name) for name in names)
-    return clock, _make_sensor(keys, signals)
-
-
-def _make_sensor(keys: SensorKeys, signals: Mapping[str, np.ndarray]) -> Sensor:
-    """Make a sensor of its rows, in SI, as the file has them."""
-    if keys.aligned and ("mount" in keys.table or "orientation" not in signals):
-        raise BadSession(f"{keys.table.where}: aligned orientations are the segment's own: no mount, and no raw data")
-    if "orientation" in signals:
-        return OrientationSensor(signals["orientation"], keys.mount, aligned=bool(keys.aligned))
-    return ImuSensor(signals["gyro"], signals["accel"], keys.mount)
+    return clock, signals
 
 
 # Gaps --------------------------------------------------------------------------------------------------------------
 
 
 def _bridge_gaps(
-    place: str, sensor: Sensor, clock: Clock, faults: Sequence[Fault], gaps: bool
-) -> tuple[Sensor, np.ndarray]:
-    """Put the rows on the clock and bridge gaps, long ones where `gaps` are accepted; and the marks (n,) of samples."""
+    place: str, rows: Mapping[str, np.ndarray], clock: Clock, faults: Sequence[Fault], gaps: bool
+) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray]:
+    """Put rows on the clock and bridge gaps, long ones where `gaps` are accepted; with `Sensor.gap` and all marks."""
     frozen = np.zeros(len(clock.time), dtype=bool)
     for fault in faults:
         frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
     signals, lost = {}, frozen.copy()
-    for signal, rows in _signals(sensor).items():
-        check_measured(f"{place}{signal}", rows)
-        signals[signal], good = _place_on_clock(rows, clock, f"{place}{signal}", signal == "orientation")
+    for signal, values in rows.items():
+        check_measured(f"{place}{signal}", values)
+        signals[signal], good = _place_on_clock(values, clock, f"{place}{signal}", signal == "orientation")
         if not good.any():
             raise BadData(f"{place}{signal}: no numbers from {format_span(clock.time[[0, -1]])}")
         if not gaps and (long := find_runs(clocks.mark_lost_samples(clock, good) == clocks.LONG)):
@@ -384,14 +377,11 @@ def _bridge_gaps(
             )
         lost |= ~good
     marks = clocks.mark_lost_samples(clock, ~lost)
-    bridged: dict[str, Any] = {
-        _FIELDS[signal]: (clocks.bridge_quat if signal == "orientation" else clocks.bridge)(values, marks, clock)
-        for signal, values in signals.items()
-    }
-    bridged["gap"] = marks == clocks.LONG if gaps or faults else None
-    return replace(sensor, **bridged), np.where(
-        frozen, clocks.GOOD, marks
-    )  # frozen samples have a diagnostic of their own
+    for signal, values in signals.items():
+        bridge = clocks.bridge_quat if signal == "orientation" else clocks.bridge
+        signals[signal] = bridge(values, marks, clock)
+    gap = marks == clocks.LONG if gaps or faults else None
+    return signals, gap, np.where(frozen, clocks.GOOD, marks)  # frozen samples have a diagnostic of their own
 
 
 def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:
