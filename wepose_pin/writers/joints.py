@@ -97,9 +97,9 @@ def _list_messages(motion: JointMotion, types: Any) -> Iterator[tuple[str, int, 
     stamps = np.maximum(np.rint(1e9 * time), 1).astype(np.int64).tolist()
     root = LinkTransform(FIXED_FRAME, motion.quat_WB[None], motion.p_WB[None])
     placed = {motion.root: root} | compute_link_transforms(motion)
-    moving = {link: each for link, each in placed.items() if not each.fixed}
+    still = {link: each for link, each in placed.items() if len(each.p) == 1}
+    moving = {link: each for link, each in placed.items() if link not in still}
     yield "/robot_description", stamps[0], types["std_msgs/msg/String"](data=motion.urdf)
-    still = {link: each for link, each in placed.items() if each.fixed}
     yield "/tf_static", stamps[0], make_transforms(stamps[0], still, 0)
     joints = list(motion.moving)
     position, velocity = (np.stack([get(joint) for joint in joints], axis=1) for get in (motion.values, motion.rates))

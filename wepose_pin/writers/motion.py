@@ -125,10 +125,10 @@ class JointMotion:
     time: np.ndarray  # (n,) [s]
     position: np.ndarray  # (n, joints) [rad or m]
     velocity: np.ndarray  # (n, joints) [rad/s or m/s]
-    posture: Mapping[str, float]  # joint that stays → its value; zero where not named
-    p_WB: np.ndarray  # (3,) [m] of the root link in W
-    quat_WB: np.ndarray  # (4,) xyzw of the root link in W
     recorded_time: np.ndarray  # (n,) [s] of the recording at each sample
+    posture: Mapping[str, float] = field(default_factory=dict)  # joint that stays → its value; zero where not named
+    p_WB: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [m] of the root link in W
+    quat_WB: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))  # xyzw of the root link in W
     phases: Mapping[str, Intervals] = field(default_factory=dict)  # `REPETITIONS` are those of the movement
     begin: int = 0  # the first sample after the robot's approach
     source: str = ""  # name of the recording that a robot follows
@@ -221,10 +221,6 @@ class LinkTransform(NamedTuple):
     quat: np.ndarray
     p: np.ndarray
 
-    @property
-    def fixed(self) -> bool:
-        return len(self.p) == 1
-
 
 def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
     """Compute the transform of every link but the root, parents before children."""
@@ -256,35 +252,33 @@ def read_joint_motion(folder: Path) -> JointMotion:
         raise MissingFile(f"{folder}: no {lost[0]} in it; a folder that `wepose retarget` wrote is wanted here")
     with library_errors(summary_file, "the summary of a trajectory"):
         summary = json.loads(summary_file.read_text(encoding="utf-8"))
-        joints = tuple(map(str, summary["joints"]))
+        joints, repetitions = tuple(map(str, summary["joints"])), summary.get(REPETITIONS) or {}
         place = np.array([float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")])
+        approach_s, spans = float(summary["approach_s"]), repetitions.get("spans", ())
+        phases = read_phases(summary) | {REPETITIONS: tuple((float(begin), float(end)) for begin, end in spans)}
         posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
-        approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
-        repetitions = summary.get(REPETITIONS) or {}
-        spans = tuple((float(begin), float(end)) for begin, end in repetitions.get("spans", ()))
-        phases = read_phases(summary) | {REPETITIONS: spans}
+        named = {"name": str(summary["robot"]), "source": str(summary["recording"])}
     columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
     values = read_columns(read_table(file), columns, str(file), str(file))
     time = values[:, 0]
     if not np.isfinite(values).all() or len(time) < 2 or np.any(np.diff(time) <= 0.0):
         raise BadData(f"{file}: needs two rows at least, a number in each cell, and times that grow")
     return JointMotion(
-        name=name,
         where=str(folder),
         robot=read_urdf(urdf),
         urdf=urdf.read_text(encoding="utf-8", errors="replace"),
         joints=joints,
         time=time,
+        recorded_time=values[:, 1],
         position=values[:, 2 : 2 + len(joints)],
         velocity=values[:, 2 + len(joints) :],
         posture=posture,
         p_WB=place[:3],
         quat_WB=place[3:] / np.linalg.norm(place[3:]),
-        recorded_time=values[:, 1],
         phases=phases,
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
-        source=source,
         no_repetitions=str(repetitions.get("reason") or ""),
+        **named,
     )
 
 
@@ -310,13 +304,9 @@ def convert_person(motion: TrackResult) -> JointMotion:
         urdf=model.urdf(),
         joints=tuple(values),
         time=pose.time,
+        recorded_time=pose.time,
         position=position,
         velocity=np.gradient(position, pose.time, axis=0),
-        posture={},
-        p_WB=np.zeros(3),
-        quat_WB=np.array([0.0, 0.0, 0.0, 1.0]),
-        recorded_time=pose.time,
-        source=motion.name,
     )
 
 
