@@ -8,7 +8,7 @@ three-dimensional motions: application to the knee", Journal of Biomechanical En
 10.1115/1.3138397.
 
 `euler` takes rotations apart and follows the angles over time; `joints` says which segments make a joint, in which
-axes and sequence, and carries the uncertainty; `tables` gives ranges, rates and the columns of a file.
+axes and sequence, and carries the uncertainty; `movement` gives ranges, rates and tables.
 """
 
 from .joints import AUTO as AUTO

@@ -228,10 +228,7 @@ def summary_table(angles: Angles) -> pl.DataFrame:
         {
             "joint": name,
             "angle": angle,
-            "lowest_deg": np.degrees(ranges.lowest[k]),
-            "highest_deg": np.degrees(ranges.highest[k]),
-            "range_deg": np.degrees(ranges.range[k]),
-            "peak_rate_deg_s": np.degrees(ranges.peak_rate[k]),
+            **{f"{measure}_{unit}": np.degrees(getattr(ranges, measure)[k]) for measure, unit in MEASURES.items()},
             "joint_near_lock": ranges.near_lock,
             "joint_gap": ranges.gap,
         }
@@ -298,7 +295,7 @@ def _tabulate_spans(movement: Movement, about: Sequence[Mapping[str, Any]]) -> p
     parts = [find_samples(pose.time, (span["from_s"], span["to_s"])) for span in about]
     for name, joint in movement.angles.joints.items():
         summaries = [summarize_joint(pose.time, joint, part) for part in parts]
-        values = np.array([np.column_stack([s.lowest, s.highest, s.range, s.peak_rate]) for s in summaries])
+        values = np.array([np.column_stack([getattr(each, measure) for measure in MEASURES]) for each in summaries])
         values[:, :, :2] -= count_turns(values[:, :, :2].mean(axis=2))[:, :, None]
         stds = compute_summary_std(pose, name, joint, np.array([each.samples for each in summaries]))
         degrees = np.degrees(values), np.degrees(stds)

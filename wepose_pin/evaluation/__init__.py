@@ -7,6 +7,5 @@ from .scores import Evaluation as Evaluation
 from .scores import PositionError as PositionError
 from .scores import angle_error as angle_error
 from .scores import attitude_error as attitude_error
-from .scores import compute_icc as compute_icc
 from .scores import evaluate as evaluate
 from .scores import uncertainty as uncertainty

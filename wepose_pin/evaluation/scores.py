@@ -264,25 +264,15 @@ def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
 
 
 def angle_error(estimated: np.ndarray, true: np.ndarray) -> AngleError:
-    """Compute the error of values (n,) [deg] against a reference's (n,)."""
-    error = estimated - true
-    mean, std = float(error.mean()), float(error.std(ddof=1)) if len(error) > 1 else np.nan
+    """Compute the error of values (n,) [deg] against a reference's (n,); the ICC is that of McGraw and Wong 1996."""
+    error, icc, n = estimated - true, np.nan, len(estimated)
+    mean, std = float(error.mean()), float(error.std(ddof=1)) if n > 1 else np.nan
     limits = mean - LIMITS * std, mean + LIMITS * std
-    icc = compute_icc(np.column_stack([estimated, true]))
+    if n > 1:  # mean squares of rows, and of the rest; the last term is that of the two columns less the rest
+        rows, rest = 0.5 * float(np.var(estimated + true, ddof=1)), 0.5 * std**2
+        spread = rows + rest + mean**2 - 2.0 * rest / n
+        icc = (rows - rest) / spread if spread > 0.0 else np.nan
     return AngleError(mean, _rms(error), float(np.abs(error).max()), std, *limits, icc, float(np.ptp(true)))
-
-
-def compute_icc(ratings: np.ndarray) -> float:
-    """Compute ICC(A,1) of n subjects by k raters (n, k), McGraw and Wong 1996; NaN where nothing varies."""
-    n, k = ratings.shape
-    if n < 2:
-        return float("nan")
-    mean, by_row, by_rater = ratings.mean(), ratings.mean(axis=1, keepdims=True), ratings.mean(axis=0)
-    rows = k * ((by_row - mean) ** 2).sum() / (n - 1)
-    columns = n * ((by_rater - mean) ** 2).sum() / (k - 1)
-    error = ((ratings - by_row - by_rater + mean) ** 2).sum() / ((n - 1) * (k - 1))
-    spread = rows + (k - 1) * error + k * (columns - error) / n
-    return float((rows - error) / spread) if spread > 0.0 else float("nan")
 
 
 def position_error(difference: np.ndarray) -> PositionError:

@@ -19,7 +19,7 @@ from ..diagnostics import Diagnostic
 from ..documents import whole_file
 from ..errors import reason
 from ..tracking import TrackResult, TrackSummary, summarize
-from ..tracking.measures import find_samples_after_start, finite_median, measure_reach
+from ..tracking.summary import find_samples_after_start, finite_median, measure_reach
 from ..writers.provenance import CALL, collect_provenance, result_folder
 from ..writers.result import write_about, write_poses
 from .page import write_pages

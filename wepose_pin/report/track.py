@@ -11,7 +11,7 @@ from ..body import BodyTable
 from ..body.kinematics import compute_axis_std
 from ..recording import format_span
 from ..tracking import TrackResult, TrackSummary
-from ..tracking.measures import (
+from ..tracking.summary import (
     SOURCES,
     compute_heading_stds,
     compute_joint_heading_stds,

@@ -36,9 +36,7 @@ class StartPoseDetector:
         self._every, self._window = max(1, round(CHECK_PERIOD_S * rate_hz)), max(4, round(CHECK_WINDOW_S * rate_hz))
         self._gyro = np.zeros((self._hold, len(measured), 3))
         self._last_quat: np.ndarray | None = None  # of the measured ones
-        self._held = 0
-        self._tick = 0
-        self._moved_at = -np.inf
+        self._held, self._tick, self._moved_at = 0, 0, -np.inf
 
     @property
     def held_s(self) -> float:
@@ -59,45 +57,38 @@ class StartPoseDetector:
 
         Return the row of the tick at which the pose was held so long, after which none may be added; None: not yet.
         """
-        for row, tick in enumerate(zip(gyro_S, accel_S, strict=True)):
-            self._push_tick(*tick)
-            if self.state == "ready":
+        rates = gyro_S
+        if self._measured.any() and len(gyro_S):  # since the last tick; zero at the first
+            quat = unpack_orientations(gyro_S[:, self._measured], accel_S[:, self._measured])
+            quat = np.concatenate([quat[:1] if self._last_quat is None else self._last_quat, quat])
+            turns = rotations.log(rotations.multiply(rotations.conjugate(quat[:-1]), quat[1:]))
+            rates, self._last_quat = gyro_S.copy(), quat[-1:]
+            rates[:, self._measured] = turns * self._rate
+        for row, rate in enumerate(rates):
+            self._tick += 1
+            self.missing = tuple(np.flatnonzero(~np.isfinite(rate).all(axis=1)).tolist())
+            if self.missing:
+                self.state, self._held = "waiting", 0
+                continue
+            self._gyro[self._held] = rate
+            self._held += 1
+            if self._held % self._every == 0 or self._held == self._hold:
+                self._check_motion(self._gyro[: self._held])
+            if self._held == self._hold:
+                self.state = "ready"
                 return row
+            self.state = "moved" if self._tick - self._moved_at < self._rate else "start_pose"
         return None
 
-    def _push_tick(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> None:
-        self._tick += 1
-        if self._measured.any():
-            gyro_S = self._find_measured_rates(gyro_S, accel_S)
-        self.missing = tuple(np.flatnonzero(~np.isfinite(gyro_S).all(axis=1)).tolist())
-        if self.missing:
-            self.state, self._held = "waiting", 0
-            return
-        self._gyro[self._held] = gyro_S
-        self._held += 1
-        if self._held % self._every == 0 or self._held == self._hold:
-            rates = self._gyro[: self._held]
-            last = rates[-self._window :]
-            mean, degrees = rates.mean(axis=0), np.degrees(1.0)
-            rate = degrees * np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
-            turned = degrees * np.linalg.norm(np.cumsum(rates - mean, axis=0) / self._rate, axis=2).max(axis=0)
-            steady = degrees * np.linalg.norm(mean, axis=1)
-            moves = (rate > SWAYS_DEG_S) | (turned > SWAYS_DEG) | (steady > SWAYS_DEG_S)
-            if moves.any():
-                self.moving = tuple(np.flatnonzero(moves).tolist())
-                self._held, self._moved_at = 0, self._tick
-        if self._held == self._hold:
-            self.state = "ready"
-        else:
-            self.state = "moved" if self._tick - self._moved_at < self._rate else "start_pose"
-
-    def _find_measured_rates(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Return `gyro_S` with the rates of measured orientations since the last tick; zero at the first."""
-        quat = unpack_orientations(gyro_S[self._measured], accel_S[self._measured])
-        last, self._last_quat = quat if self._last_quat is None else self._last_quat, quat
-        rates = gyro_S.copy()
-        rates[self._measured] = rotations.log(rotations.multiply(rotations.conjugate(last), quat)) * self._rate
-        return rates
+    def _check_motion(self, rates: np.ndarray) -> None:
+        """Begin again where a sensor moves by its rates (n, k, 3) [rad/s]."""
+        last, mean, degrees = rates[-self._window :], rates.mean(axis=0), np.degrees(1.0)
+        rate = degrees * np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
+        turned = degrees * np.linalg.norm(np.cumsum(rates - mean, axis=0) / self._rate, axis=2).max(axis=0)
+        moves = (rate > SWAYS_DEG_S) | (turned > SWAYS_DEG) | (degrees * np.linalg.norm(mean, axis=1) > SWAYS_DEG_S)
+        if moves.any():
+            self.moving = tuple(np.flatnonzero(moves).tolist())
+            self._held, self._moved_at = 0, self._tick
 
 
 def split_start_pose(received: Recording) -> tuple[Recording, Recording] | None:

@@ -218,22 +218,6 @@ class Tracker:
         self._variance = np.full((3, k), np.nan)
         return orientation
 
-    def _observe_headings(
-        self, first: Recording, orientation: Mapping[str, Orientation], states: tuple[np.ndarray, ...]
-    ) -> int:
-        """Let headings be corrected where something observes them; return the first sample after the start pose."""
-        begin = int(np.searchsorted(first.time, self._start[1], side="right"))
-        noises, quat_LS = (
-            {name: each.noise for name, each in orientation.items()},
-            dict(zip(self.names, self._quat_LS, strict=True)),
-        )
-        known = _describe_headings(*(values[:begin] for values in states))
-        heading_filter = HeadingFilter(first, quat_LS, noises, self._person, self._body, known, causal=self._causal)
-        if heading_filter.is_observed:
-            self._headings = HeadingCorrector(heading_filter, self._heading_offset.copy())
-            self._variance = self._headings.variance if self._causal else self._variance
-        return begin
-
     def _place(self, chunk: Recording) -> _Placed:
         """Filter a chunk and place its segments, with headings that are corrected causally."""
         is_first, begin = not self.names, 0
@@ -241,7 +225,14 @@ class Tracker:
         n, states = len(chunk), self._stack(chunk, orientation)
         quat_VS, attitude_cov = states[:2]
         if is_first and self._observes_headings and not any(each.aligned for each in chunk.sensors.values()):
-            begin = self._observe_headings(chunk, orientation, states)
+            begin = int(np.searchsorted(chunk.time, self._start[1], side="right"))  # first sample after the start pose
+            known = _describe_headings(*(values[:begin] for values in states))
+            noises = {name: each.noise for name, each in orientation.items()}
+            mounts = dict(zip(self.names, self._quat_LS, strict=True))
+            heading_filter = HeadingFilter(chunk, mounts, noises, self._person, self._body, known, causal=self._causal)
+            if heading_filter.is_observed:
+                self._headings = HeadingCorrector(heading_filter, self._heading_offset.copy())
+                self._variance = self._headings.variance if self._causal else self._variance
         quat_WL, offset = np.empty(quat_VS.shape), np.empty(quat_VS.shape[:2])
         variance = np.empty((*offset.shape, 3))
         before, size = len(self._recent), self._recent.maxlen or 1
