@@ -133,18 +133,31 @@ class HeadingFilter:
         causal: bool,
     ) -> None:
         self.names, self.causal, self._last, k = tuple(quat_LS), causal, start, len(quat_LS)
-        kind = int(model.table.is_mechanism)
-        self._rate_var, hinge_std = RATE_STD[kind] ** 2, float(HINGE_STD[kind])
+        kind, start_pose = int(model.table.is_mechanism), StartPose(model.neutral_rotations)
+        self._rate_var = RATE_STD[kind] ** 2
         raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
         self.measured = np.array([name not in raw for name in self.names])
         self.pairs, levers, lever_std, travels = find_joint_pairs(model, raw if first.rate_hz >= LEAST_RATE_HZ else {})
-        self.hinges, axis_std, tilt_std, self._hinge_std = _find_hinges(first, self.names, subject, model, hinge_std)
+        # Hinges between two sensors; standard deviations [rad] of the axis about the long axis of the segment above and
+        # across, and of the angle between the hinge's plane and the segment below.
+        hinges: list[tuple[HingeJoint, float, float, float]] = []
+        # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
+        calibrated = {} if first.remounted else subject.hinges
+        for hinge in find_hinges(model, start_pose, self.names):
+            if (own := calibrated.get(hinge.name)) is not None:
+                hinges.append((hinge._replace(axis=start_pose.turn(hinge.on, own.axis)), AXIS_STD, TILT_STD, own.std))
+            elif not kind:
+                axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
+                hinges.append((hinge, axis_std, hinge.tilt_std, hinge.softness))
+        self.hinges = tuple(hinge for hinge, *_ in hinges)
+        axis_stds, tilt_stds, plane_stds = np.array([stds for _, *stds in hinges]).reshape(-1, 3).T
+        self._hinge_std = np.maximum(plane_stds, HINGE_STD[kind])
         [closure] = load_protocol(CLASP).closures
         self.palms, (left, right) = None, closure.points
         if {left, right} <= set(model.table.points):
             with contextlib.suppress(BadSession):  # the sensors do not tell where they are
                 points = (left, 1.0), (right, -1.0)
-                self.palms = PointPath(model, StartPose(model.neutral_rotations), self.names, points)
+                self.palms = PointPath(model, start_pose, self.names, points)
         self.is_observed = bool(self.pairs or self.hinges or (self.palms and first.phases.get(CLASP)))
         self.sensor_rate_hz, self.stride = first.rate_hz, max(1, round(first.rate_hz / SAMPLE_RATE_HZ))
         knot_s = CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S
@@ -178,9 +191,9 @@ class HeadingFilter:
             "rate": (rate_std, always),  # [rad/s] at which δ drifts
             "scale": (np.full(k, SCALE_STD), always),  # of a gyroscope
             "joint": (joint_std, JOINT_CORRELATION_S),  # [rad] of the heading by a joint's acceleration
-            "axis": (axis_std, always),  # [rad] of a hinge about the long axis of the segment above
+            "axis": (axis_stds, always),  # [rad] of a hinge about the long axis of the segment above
             "twist": (twist_std, TWIST_CORRELATION_S),  # [rad] of that segment's sensor, the same
-            "tilt": (tilt_std, always),  # [rad] of a hinge about the direction across
+            "tilt": (tilt_stds, always),  # [rad] of a hinge about the direction across
             "mount": (np.zeros(k), always),  # [rad] of a mount's heading
             "force": (force_std, FORCE_CORRELATION_S),  # [m/s²] fixed in the sensor's frame
             "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
@@ -443,30 +456,6 @@ def _split_misfit(misfit: np.ndarray, correlated_samples: float) -> tuple[float,
     by_chance = variance / horizontal * correlated_samples / samples
     coherent = COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
     return variance, min(coherent, LARGEST_COHERENT_SHARE**2 * variance * 2.0 * samples / horizontal)
-
-
-def _find_hinges(
-    first: Recording, names: tuple[str, ...], subject: Subject, model: BodyModel, hinge_std: float
-) -> tuple[tuple[HingeJoint, ...], np.ndarray, np.ndarray, np.ndarray]:
-    """Find the h hinges between two sensors, and standard deviations (h,) [rad] of three errors.
-
-    They are of the axis about the long axis of the segment above and across, and of the angle between the hinge's plane
-    and the segment below, at least `hinge_std`.
-    """
-    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
-    start, calibrated = StartPose(model.neutral_rotations), {} if first.remounted else subject.hinges
-    hinges, stds = [], []
-    for hinge in find_hinges(model, start, names):
-        if hinge.name in calibrated:
-            own = calibrated[hinge.name]
-            hinges.append(hinge._replace(axis=start.turn(hinge.on, own.axis)))
-            stds.append((AXIS_STD, TILT_STD, max(own.std, hinge_std)))
-        elif not model.table.is_mechanism:
-            hinges.append(hinge)
-            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
-            stds.append((axis_std, hinge.tilt_std, max(hinge.softness, hinge_std)))
-    axis_stds, tilt_stds, plane_stds = np.array(stds).reshape(-1, 3).T
-    return tuple(hinges), axis_stds, tilt_stds, plane_stds
 
 
 def symmetric(P: np.ndarray) -> np.ndarray:

@@ -68,24 +68,21 @@ class TrackSummary:
 
     def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
         """Iterate over chunks, and add each."""
-        for chunk in chunks:
-            self._add(chunk)
-            yield chunk
-
-    def _add(self, tracked: TrackResult) -> None:
-        rows = slice(-self._samples % self._every, None, self._every)
-        self._poses.append(tracked.pose.cut(rows))
-        for segment, orientation in tracked.segments.orientation.items():
-            self._static.setdefault(segment, []).append(orientation.static)
-            self._orientations.setdefault(segment, []).append(orientation.take(rows))
-        residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.segments.quat_WL)
-        for segment, angle in residuals.items():
-            self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
-        for name, values in tracked.joints.items() if tracked.model.table.is_mechanism else ():
-            least, most = self._joints.get(name, (np.inf, -np.inf))
-            self._joints[name] = float(np.minimum(least, values.min())), float(np.maximum(most, values.max()))
-        self._samples += len(tracked.time)
-        self.last = tracked
+        for tracked in chunks:
+            rows = slice(-self._samples % self._every, None, self._every)
+            self._poses.append(tracked.pose.cut(rows))
+            for segment, orientation in tracked.segments.orientation.items():
+                self._static.setdefault(segment, []).append(orientation.static)
+                self._orientations.setdefault(segment, []).append(orientation.take(rows))
+            residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.segments.quat_WL)
+            for segment, angle in residuals.items():
+                self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
+            for name, values in tracked.joints.items() if tracked.model.table.is_mechanism else ():
+                least, most = self._joints.get(name, (np.inf, -np.inf))
+                self._joints[name] = float(np.minimum(least, values.min())), float(np.maximum(most, values.max()))
+            self._samples += len(tracked.time)
+            self.last = tracked
+            yield tracked
 
     @cached_property
     def recording(self) -> Recording:
@@ -125,8 +122,36 @@ class TrackSummary:
 
     @cached_property
     def error_budget(self) -> dict[str, dict[str, float]]:
-        """As `compute_error_budget`."""
-        return compute_error_budget(self.tracked)
+        """Point → source of error → its share of the standard deviation [m] per axis, rms over time; the largest first.
+
+        Shares below a tenth of a millimetre are left out. It is empty of a mechanism, and where no covariance is known.
+        """
+        tracked, pose, body = self.tracked, self.tracked.pose, self.tracked.model
+        every = max(1, round(PERIOD_S * tracked.rate_hz)) if len(tracked.time) > 1 else 1
+        rows = np.arange(0, len(tracked.time), every)
+        for known in (*pose.quat_WL.values(), *pose.segment_cov.values()):
+            rows = rows[np.isfinite(known[rows].sum(axis=tuple(range(1, known.ndim))))]
+        if body.table.is_mechanism or not pose.point_cov or not len(rows):
+            return {}
+        quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}
+        soft = {name: compute_soft_tissue_covariance(body.personal_table, quat_WL, name) for name in pose.segment_cov}
+        zero = {name: np.zeros_like(cov) for name, cov in soft.items()}
+        shape_cov = tracked.subject.shape_covariance(body.table)
+        of_girdles, none, k = shape_cov.copy(), 0.0 * shape_cov, len(body.lengths)
+        of_girdles[:k], of_girdles[:, :k] = 0.0, 0.0
+        cases = (zero, none), (zero, of_girdles), (zero, shape_cov), (soft, none)
+        covs = [compute_point_covariances(body, quat_WL, *case) for case in cases]
+        budget = {}
+        for point, cov in pose.point_cov.items():
+            total, law, girdles, shape, tissue = (
+                float(np.mean(np.trace(each, axis1=1, axis2=2))) / 3.0
+                for each in (cov[rows], *(own[point] for own in covs))
+            )
+            variances = tissue - law, total - shape - tissue + law, shape - girdles, girdles
+            stds = {source: float(np.sqrt(max(value, 0.0))) for source, value in zip(SOURCES, variances, strict=True)}
+            ordered = sorted(stds.items(), key=lambda item: -item[1])
+            budget[point] = {source: std for source, std in ordered if std >= 1e-4}
+        return budget
 
     @cached_property
     def residual_rms(self) -> dict[str, float]:
@@ -342,38 +367,6 @@ def find_samples_after_start(tracked: TrackResult) -> np.ndarray:
     """
     since = tracked.time >= tracked.segments.start[1] - 1e-9
     return since if since.any() else ~since
-
-
-def compute_error_budget(tracked: TrackResult) -> dict[str, dict[str, float]]:
-    """Point → source of error → its share of the standard deviation [m] per axis, rms over time; the largest first.
-
-    Shares below a tenth of a millimetre are left out. It is empty of a mechanism, and where no covariance is known.
-    """
-    pose, body = tracked.pose, tracked.model
-    rows = np.arange(0, len(tracked.time), max(1, round(PERIOD_S * tracked.rate_hz)) if len(tracked.time) > 1 else 1)
-    for known in (*pose.quat_WL.values(), *pose.segment_cov.values()):
-        rows = rows[np.isfinite(known[rows].sum(axis=tuple(range(1, known.ndim))))]
-    if body.table.is_mechanism or not pose.point_cov or not len(rows):
-        return {}
-    quat_WL = {name: quat[rows] for name, quat in pose.quat_WL.items()}
-    soft = {name: compute_soft_tissue_covariance(body.personal_table, quat_WL, name) for name in pose.segment_cov}
-    zero = {name: np.zeros_like(cov) for name, cov in soft.items()}
-    shape_cov = tracked.subject.shape_covariance(body.table)
-    of_girdles, none, k = shape_cov.copy(), 0.0 * shape_cov, len(body.lengths)
-    of_girdles[:k], of_girdles[:, :k] = 0.0, 0.0
-    cases = (zero, none), (zero, of_girdles), (zero, shape_cov), (soft, none)
-    covs = [compute_point_covariances(body, quat_WL, *case) for case in cases]
-    budget = {}
-    for point, cov in pose.point_cov.items():
-        total, law, girdles, shape, tissue = (
-            float(np.mean(np.trace(each, axis1=1, axis2=2))) / 3.0
-            for each in (cov[rows], *(own[point] for own in covs))
-        )
-        variances = tissue - law, total - shape - tissue + law, shape - girdles, girdles
-        stds = {source: float(np.sqrt(max(value, 0.0))) for source, value in zip(SOURCES, variances, strict=True)}
-        ordered = sorted(stds.items(), key=lambda item: -item[1])
-        budget[point] = {source: std for source, std in ordered if std >= 1e-4}
-    return budget
 
 
 def finite_max(values: np.ndarray) -> float:
