@@ -132,7 +132,7 @@ class LiveLoop(Stage):
                 self.log.path = None
             if self._end_message:  # when the recording is complete
                 self.send_status()
-        if self.log.problem:
+        if self.log.problem and self.log.path is not None:
             facts = {"variant": "disk", "reason": self.log.problem}
             self._diagnostics += (Diagnostic("file-incomplete", WARNING, str(self.log.path), facts=facts),)
         rows = zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True)

@@ -138,7 +138,7 @@ class LivePage(Output):
         server.stop()
         for client in list(self.clients):
             if self.newest_status is not None:
-                client.send(encode_status(self.newest_status))
+                client.send(json.dumps(_to_json(self.newest_status), allow_nan=False))
             client.close(1001, "ended")
         for _ in range(int(GOODBYE_S / 0.01)):
             if self.clients:
@@ -156,7 +156,7 @@ class LivePage(Output):
                 continue
             if status is not None and client.status is not status:
                 client.status = status
-                client.send(encode_status(status))
+                client.send(json.dumps(_to_json(status), allow_nan=False))
             if client.drawn is not drawn:
                 client.drawn = drawn
                 frame = frame or encoder.encode(pose)
@@ -328,10 +328,6 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }
     return fill_page("live/templates/live.html.j2", content, title or "wepose live")
-
-
-def encode_status(status: Status) -> str:
-    return json.dumps(_to_json(status), allow_nan=False)
 
 
 def _to_json(value: Any) -> Any:

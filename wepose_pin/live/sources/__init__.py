@@ -106,7 +106,7 @@ class Source(ABC):
         return time.monotonic()
 
     def close(self) -> None:  # noqa: B027
-        """Disconnect and free what `open` took. May be called twice."""
+        """Disconnect and free what `open` took. May be called twice, or without `open`."""
 
     def count(self, problem: str, number: int = 1) -> None:
         """Count a problem; of very many kinds the rest is one."""
