@@ -47,24 +47,24 @@ class WholeBodyActivity(Activity):
             self.p_LS[f"{side}_shank"] = np.array((0.06, 0.0, -0.36 * lengths[f"{side}_shank"]))
             self.p_LS[f"{side}_foot"] = np.array((0.4 * lengths[f"{side}_foot"], 0.0, 0.0))
 
-    def leg(self, _side: str, t: np.ndarray) -> np.ndarray:
-        """Compute the angles of hip, knee and ankle (3, n, 3) [rad] at the times `t` (n,) [s], as `angles.JOINTS`."""
-        return np.zeros((3, len(t), 3))
-
     @abstractmethod
     def trunk(self, t: np.ndarray) -> np.ndarray:
-        """Compute the rotation vectors of torso, pelvis and head (3, n, 3) [rad] in W at the times `t` (n,) [s]."""
+        """Return the rotation vectors of torso, pelvis and head (3, n, 3) [rad] in W at the times `t` (n,) [s]."""
 
     @abstractmethod
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
-        """Compute flexion of shoulder and elbow (n, 2) [rad] at the times `t` (n,) [s]."""
+        """Return flexion of shoulder and elbow (n, 2) [rad]."""
+
+    def leg(self, _side: str, t: np.ndarray) -> np.ndarray:
+        """Return the angles of hip, knee and ankle (3, n, 3) [rad], as `angles.JOINTS`."""
+        return np.zeros((3, len(t), 3))
 
     def shoulder(self, side: str, t: np.ndarray) -> Rotation:
-        """Compute the rotation of the upper arm in the torso at the times `t` (n,) [s]."""
+        """Return the rotation of the upper arm in the torso."""
         return turn_about("Y", -self.arm(side, t)[:, :1])
 
     def root(self, _t: np.ndarray, /) -> np.ndarray | None:
-        """Compute where the root is at times (n,) [s]: (n, 3) [m] in a world at rest; None: it does not move."""
+        """Return where the root is (n, 3) [m] in a world at rest; None: it does not move."""
         return None
 
     def __call__(self, t: np.ndarray, segments: Collection[str] = tuple(SIDES)) -> BodyPose:
@@ -110,9 +110,8 @@ def find_carriers(model: BodyModel) -> dict[str, tuple[str, np.ndarray]]:
     Carriers come first; what the root carries has an empty carrier.
     """
     body, segments = model.pin, list(model.table.segments)
-    joint_of = {
-        link: body.frames[body.getFrameId(link)].parentJoint for link in (*segments, *model.point_frames.values())
-    }
+    links = [*segments, *model.point_frames.values()]
+    joint_of = {link: body.frames[body.getFrameId(link)].parentJoint for link in links}
     segment_of = {joint_of[segment]: segment for segment in segments}
     links = sorted(joint_of, key=lambda link: (len(body.supports[joint_of[link]]), link not in segments))
     _, p_W = compute_link_poses(model, pin.neutral(body)[np.newaxis], links, rotations=False)
@@ -128,10 +127,8 @@ def find_carriers(model: BodyModel) -> dict[str, tuple[str, np.ndarray]]:
 class Walk(WholeBodyActivity):
     """Walking: each leg the other half a stride later, the arms against the legs, torso against pelvis.
 
-    Hip, knee and ankle in the sagittal plane: Perry & Burnfield 2010, "Gait Analysis: Normal and Pathological
-    Function", 2nd ed., the angles at the ends of the phases of a stride, and the sizes of the pelvis's motion. The
-    shoulder from 24° of extension to 8° of flexion: Perry 1992, first edition of the same, chapter 8. The small angles
-    in the other planes, the torso's, and the elbow's are assumptions.
+    Sagittal angles of the leg and the pelvis's motion: Perry & Burnfield 2010, "Gait Analysis: Normal and Pathological
+    Function". The shoulder: Perry 1992, first edition, chapter 8. All other angles are assumptions.
     """
 
     phase = "walk"
@@ -180,13 +177,12 @@ class Walk(WholeBodyActivity):
             pitch = mean + forward * np.sin(2.0 * angle)
             return np.column_stack((side * np.sin(angle), pitch, turn * np.cos(angle)))
 
-        torso, pelvis = sway(*self._TORSO_DEG), sway(*self._PELVIS_DEG)
-        return np.stack((size * torso, size * pelvis, size * self._HEAD_SHARE * torso))
+        torso = sway(*self._TORSO_DEG)
+        return np.stack((size * torso, size * sway(*self._PELVIS_DEG), size * self._HEAD_SHARE * torso))
 
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
         forward = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._cycle(t, side))  # 0 at the first contact of its own foot
-        back, swing = self._ARM_DEG
-        return self.activity(t)[:, None] * np.radians(back + swing * forward[:, None])
+        return self.activity(t)[:, None] * np.radians(self._ARM_DEG[0] + self._ARM_DEG[1] * forward[:, None])
 
 
 class Run(Walk):
@@ -250,10 +246,9 @@ class Throw(WholeBodyActivity):
         self.sizes = rng.uniform(0.93, 1.05, max(1, int(self.seconds // self._PERIOD_S)))  # of each throw
 
     def _angles(self, t: np.ndarray) -> np.ndarray:
-        """Compute the columns of `_THROW` from the third on, (n, 6) [rad]."""
-        postures = np.radians(self._THROW[:, 2:])
-        changes = np.diff(postures, axis=0, prepend=0.0)
-        angles = np.zeros((len(t), postures.shape[1]))
+        """Return the columns of `_THROW` from the third on, (n, 6) [rad]."""
+        changes = np.diff(np.radians(self._THROW[:, 2:]), axis=0, prepend=0.0)
+        angles = np.zeros((len(t), changes.shape[1]))
         for k, size in enumerate(self.sizes):
             for (begin, duration), change in zip(self._THROW[:, :2], changes, strict=True):
                 at = STAND_S + k * self._PERIOD_S + 0.5 + begin
@@ -266,7 +261,6 @@ class Throw(WholeBodyActivity):
         return np.stack((torso, 0.4 * torso, 0.2 * torso))
 
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
-        """Compute no flexion of the shoulder, which `shoulder` turns, and that of the elbow."""
         return np.column_stack((np.zeros_like(t), self._angles(t)[:, 3] if side == self.side else np.zeros_like(t)))
 
     def shoulder(self, side: str, t: np.ndarray) -> Rotation:
@@ -279,9 +273,7 @@ class Throw(WholeBodyActivity):
 class Sit(WholeBodyActivity):
     """Sitting down and standing up again, some times; the trunk leans forward while the body moves.
 
-    Seated, the hips and knees are bent to 90°, the elbows to 75°, and the pelvis is upright. The feet stay level to a
-    few degrees. Durations near those of Nuzik et al. 1986 (Phys Ther 66:1708-1713); sizes of lean and tilt are
-    assumptions.
+    Durations are near those of Nuzik et al. 1986 (Phys Ther 66:1708-1713); sizes of lean and tilt are assumptions.
     """
 
     phase = "sit"
@@ -293,9 +285,9 @@ class Sit(WholeBodyActivity):
         times = int(self.seconds // period)
         if times < 1:
             raise BadOption(f"seconds {self.seconds:g}: sitting down and standing up once takes 8")
-        up = self._MOVE_S + self._PAUSE_S[1]  # from the beginning of the way down to that of the way up
         starts = STAND_S + self._PAUSE_S[0] + period * np.arange(times)
-        self.ways = [(start, start + up) for start in starts.tolist()]  # down and up begin [s]
+        up = self._MOVE_S + self._PAUSE_S[1]
+        self.ways = [(start, start + up) for start in starts.tolist()]  # the ways down and up begin [s]
         self.lean = np.radians(35.0 * rng.uniform(0.85, 1.15))
         self.tilt = 0.6 * self.lean  # of the pelvis, forward
         self.spread = np.radians(rng.uniform(3.0, 10.0, 2))  # of each thigh outwards, seated

@@ -134,13 +134,10 @@ PRESETS = {"ideal": IDEAL_PRESET, "mild": MILD_PRESET, "people": PEOPLE_PRESET}
 class ImuNoise:
     """Noise of an IMU; the defaults are those of the Xsens MTi-3.
 
-    Densities and in-run stabilities: MTi 1-series data sheet (0.007 deg/s/sqrt(Hz), 10 deg/h; 120
-    ug/sqrt(Hz), 0.03 mg). It gives no turn-on bias that is comparable: 0.2 deg/s and 3 mg are assumptions.
-
-    White noise has the standard deviation density * sqrt(rate) at each sample, the convention of angle and
-    velocity random walk. The bias is the turn-on bias, constant over the recording, plus a first-order
-    Gauss-Markov process whose standard deviation is the in-run stability and whose correlation time is an
-    assumption as well.
+    Densities and in-run stabilities are of the MTi 1-series data sheet; turn-on biases and the correlation time are
+    assumptions. White noise has the standard deviation density * sqrt(rate) at each sample, the convention of angle
+    and velocity random walk. The bias is the turn-on bias, constant over the recording, plus a first-order Gauss-Markov
+    process whose standard deviation is the in-run stability.
     """
 
     gyro_density: NonNegative = float(np.deg2rad(0.007))  # [rad/s/sqrt(Hz)]

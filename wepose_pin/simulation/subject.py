@@ -40,13 +40,9 @@ _MIDPOINTS = (np.arange(4) + 0.5) / 4.0  # of an interval's quarters, for its me
 class Simulation:
     """The result of `simulate`: exact motion, IMU data, and the contents of the session file.
 
-    `quat_LS` is R_LS = Swing @ N, where N takes the axes of `stated_mount` to z (up) and x (forward) of the
-    segment and Swing turns by 2 to 10 deg about a horizontal axis. So, in an exact N-pose, the stated axes and gravity
-    measured there give the mount exactly: Swing is the least rotation from N @ (up in S) to e_z. With mounts at any
-    rotation nothing is stated.
-
-    Motion is that of the true skeleton, at `time`. Soft tissue turns a sensor by `soft_tissue` from its mount:
-    R_WS = R_WL @ exp(soft_tissue_L) @ R_LS, which is `quat_WS`. It and the IMU data are at `sample_time`.
+    A stated mount is the true one, R_LS, apart from a turn of 2 to 10 deg about a horizontal axis: in an exact N-pose
+    gravity corrects it exactly. Motion is that of the true skeleton, at `time`. Soft tissue turns a sensor from its
+    mount: R_WS = R_WL @ exp(soft_tissue_L) @ R_LS, which is `quat_WS`. It and the IMU data are at `sample_time`.
     """
 
     time: np.ndarray  # (n,) [s], from 0
@@ -62,8 +58,8 @@ class Simulation:
     accel_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], exact
     lengths: dict[str, float]  # [m]
     phases: dict[str, list[tuple[float, float]]]
-    """[s]. "start": static in the N-pose; "clasp": palms together; "circles": first lift off the table to last
-    return; "rest": each rest of the right hand on the table, all sensors static (but for the sway)."""
+    """[s]. "start": static in the N-pose; "circles": first lift off the table to last return; "rest": each rest of the
+    right hand on the table, all sensors static (but for the sway); the others are those of the protocol."""
     imperfections: Imperfections
     quat_WS: dict[str, np.ndarray]  # sensor -> (n, 4) xyzw, its own true orientation
     soft_tissue: dict[str, np.ndarray]  # sensor -> (n, 3) [rad], rotation vector in L
@@ -74,11 +70,7 @@ class Simulation:
         return f"Simulation({self.time[-1] - self.time[0]:.1f} s at {self.rate_hz:g} Hz, {len(self.gyro_S)} sensors)"
 
     def recording(self, name: str = "simulated") -> Recording:
-        """Return the recording that a user would have: sensors, stated mounts and phases, without truth.
-
-        It has the stated times, so that clock errors stay in the data as in a file. The readers' code bridges lost
-        samples.
-        """
+        """Return the recording that a user would have, without truth; clock errors stay in the data, as in a file."""
         clock = Clock(self.time, np.arange(len(self.time)), 1.0 / self.rate_hz)
         sensors = {}
         for segment, gyro_S in self.gyro_S.items():
@@ -94,12 +86,9 @@ class Simulation:
 
     @property
     def girdles(self) -> dict[str, np.ndarray]:
-        """Girdle → (7,) what the person's shoulders differ by from the law of the body's table, as far as it is known.
-
-        Without `Imperfections.girdle` they do not move; what a person has beside de Groot's regression is not in it.
-        """
-        own = (1.0 - min(self.imperfections.girdle, 1.0)) * FIXED + 0.0  # no -0.0 in a file
-        return dict.fromkeys(load_table().girdles, own)
+        """Girdle → (7,) by what the person's shoulders differ from the law of the body's table."""
+        # Without `Imperfections.girdle` they do not move; what a person has beside the law is not known. No -0.0.
+        return dict.fromkeys(load_table().girdles, (1.0 - min(self.imperfections.girdle, 1.0)) * FIXED + 0.0)
 
     def truth(self) -> Pose:
         """Return the exact pose, in the W of tracking, whose x is where the torso faces in the start phase."""
@@ -117,9 +106,9 @@ class Simulation:
 def _sample_sensor(
     motion: BodyMotion, segment: str, R_LS: Rotation, tissue: SoftTissue, t: np.ndarray, poses: Sequence[BodyPose] = ()
 ) -> tuple[Rotation, np.ndarray, np.ndarray]:
-    """Sample a sensor on its segment at the times `t` (n,) [s], without errors of its own; `poses`: of `_sample_poses`.
+    """Sample a sensor without errors of its own at the times `t` (n,) [s], by `_sample_poses`.
 
-    Its orientations (n) in W, specific force (n, 3) [m/s^2] in S, and the soft tissue's rotation vectors (n, 3) [rad].
+    Return orientations (n) in W, specific force (n, 3) [m/s^2] in S, and rotation vectors of tissue (n, 3) [rad] in L.
     """
     pose, *around = poses or _sample_poses(motion, t, [segment])
     p_W, *others_W = (
@@ -154,23 +143,19 @@ def simulate(
 ) -> Simulation:
     """Simulate a person with five sensors in the upper-body experiment of Lisini Baldi et al. 2019; the truth is known.
 
-    0 to 5 s static in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
-    the torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a
-    table; then `circles` circles in the air, a rest on the table before and after each.
+    5 s static in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while the torso leans
+    and twists; 2.5 s in which the right hand goes to a table; then `circles` circles in the air, with rests between.
 
     Parameters
     ----------
     lengths : length → [m]: ``trunk``, ``shoulder_width``, ``left_upper_arm``, ``left_forearm``, ``left_hand`` and the
         same of the right
     seed : the same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of
-        their own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as
-        large
-    rate_hz : samples a second
+        their own: noise and rate change neither motion nor mounts
     noise : of gyroscope and accelerometer; by default that of an Xsens MTi-3, `wp.NOISE_FREE` for none
     imperfections : of subject, mounting and sensors; `wp.IDEAL_PRESET` for none, `wp.MILD_PRESET` for a careful
         subject, `wp.PEOPLE_PRESET` for the sizes that the literature reports
     clasp_s : [s] duration of the clasp, at least 5
-    circles : number of circles, 0 or more
     protocol : what the person does in the time of the clasp: "clasp", "t_pose", "bow", or several joined by "+"
 
     Returns
@@ -232,11 +217,6 @@ def simulate_activity(
         have the random part only, and what people hold in the start pose they hold throughout
     seconds : [s] duration of the activity
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
-
-    Returns
-    -------
-    Simulation
-        As that of `simulate`.
 
     Raises
     ------
@@ -333,17 +313,7 @@ def simulate_person(seed: int, measured_std: float = MEASURED_STD, body: str = D
     seed : the same seed gives the same person
     measured_std : [m] error of both measurements: by default that of a careful measurement between the joint centres
         themselves. Nobody can reach them: `PEOPLE_MEASURED_STD` is the error of 0.83 times the biacromial breadth
-    body : the body whose lengths are drawn: "upper_body" or "whole_body"
-
-    Returns
-    -------
-    Person
-        Its `lengths` are those that `simulate` takes, its `prior` is a subject of that stature and sex.
-
-    Raises
-    ------
-    BadModel
-        No such body.
+    body : the body whose lengths are drawn: "upper_body" or "whole_body", else `BadModel`
 
     Examples
     --------
