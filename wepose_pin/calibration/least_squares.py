@@ -268,9 +268,7 @@ def _measure_block(fit: LeastSquares, block: Block) -> tuple[float, float]:
     span, columns, contact, least_variance = block
     r = fit.residuals[span, columns]
     variance = float(contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(contact.sum()))
-    return max(variance, least_variance), count_correlated_samples(
-        r * contact[:, None], find_min_correlation(fit.data[-1])
-    )
+    return max(variance, least_variance), count_correlated_samples(r * contact[:, None], fit.data[-1])
 
 
 def _state_weights(fit: LeastSquares) -> np.ndarray:
@@ -294,9 +292,9 @@ def find_min_correlation(time: np.ndarray) -> float:
     return LEAST_CORRELATION_S / max(float(np.median(np.diff(time))), 1e-3)
 
 
-def count_correlated_samples(r: np.ndarray, least: float) -> float:
-    """How many samples of `r` (n, k) make one independent one, at least `least`: 1 + 2 Σ ρ up to the first zero."""
-    n = len(r)
+def count_correlated_samples(r: np.ndarray, time: np.ndarray) -> float:
+    """Return how many samples of `r` (n, k) at times (n,) [s] make one independent one: 1 + 2 Σ ρ to the first zero."""
+    n, least = len(r), find_min_correlation(time)
     spectrum = np.abs(np.fft.rfft(r - r.mean(axis=0), 2 * n, axis=0)) ** 2
     rho = np.fft.irfft(spectrum, 2 * n, axis=0)[:n].sum(axis=1)
     if not rho[0] > 0.0:

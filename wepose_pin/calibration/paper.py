@@ -28,7 +28,7 @@ from ..body.girdle import FIXED
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, BadSubject, NoSolution, one_of
-from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples, find_min_correlation
+from .least_squares import LEAST_VARIANCE, MIN_LENGTH, MeasuredLength, count_correlated_samples
 from .problem import CalibrationProblem
 from .protocols import Closure
 from .result import Calibration
@@ -82,7 +82,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         shortest = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
         raise NoSolution(f"{recording.where()}: the gap is least with {shortest}; {advice}")
     gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in names]
-    correlated = count_correlated_samples(gaps, find_min_correlation(data[-1]))  # samples that make one independent one
+    correlated = count_correlated_samples(gaps, data[-1])  # samples that make one independent one
     variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
     covariance = correlated * variance * by_gap + by_d @ d_cov @ by_d.T
     others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]

@@ -262,20 +262,16 @@ class CalibrationProblem:
             places.append(place)
             seconds = len(samples) * stride / recording.rate_hz
             if seconds < LEAST_S:
-                text = (
-                    f"{_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; at least {LEAST_S:g}"
-                )
-                text += " s are needed, better a minute"
+                text = f"{_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; at least "
+                text += f"{LEAST_S:g} s are needed, better a minute"
                 if not connected[phase].all():
                     text += f"; sensors.{lost} is lost from {format_span(loss)}, and its heading with it: name a start "
                     text += "pose and a motion with nothing lost between them, or record again"
                 raise BadPhase(f"{recording.where()}: {text}")
         samples = np.concatenate(parts)
-        rotations_since_start = [
-            (self.R_VS[name][samples] * self.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
-        ]
+        since_start = [(self.R_VS[name][samples] * self.R_VS_start[name].inv()).as_quat().T for name in layout.sensors]
         recorded = np.concatenate(places).T[: layout.place.stop - layout.place.start]
-        data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - self.start[1]])
+        data = np.vstack([*since_start, recorded, recording.time[samples] - self.start[1]])
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         return data, condition_index, samples
 

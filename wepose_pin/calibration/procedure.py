@@ -270,9 +270,7 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
 def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquares, x_cov: np.ndarray) -> Calibration:
     """Return the calibration that a solution at samples (n,) makes, with the covariance (m, m) of x."""
     layout, prior = problem.layout, problem.prior
-    closed = np.zeros(len(samples), dtype=bool)
-    for _, span in fit.closures:
-        closed[span] = True
+    closed = np.array([isinstance(condition, Closure) for condition in layout.conditions])[fit.condition_index]
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
     scale = "of the population prior" if prior.is_population else f"of {prior.name}"
@@ -429,10 +427,8 @@ def fuse_calibrations(earlier: Subject, subject: Subject, table: BodyTable) -> S
 
     order = [*subject.order, *(row for row in shape_rows if row not in subject.order)]
     missing = len(order) - len(subject.order)
-    covariance, at = (
-        block_diag(subject.covariance, np.zeros((missing, missing))),
-        [order.index(row) for row in shape_rows],
-    )
+    covariance = block_diag(subject.covariance, np.zeros((missing, missing)))
+    at = [order.index(row) for row in shape_rows]
     gain = covariance[:, at] @ K[1]
     gain[at] = np.eye(len(at))
     covariance += gain @ (fused - covariance[np.ix_(at, at)]) @ gain.T

@@ -69,14 +69,10 @@ class Check(NamedTuple):
 
     diagnostic: Diagnostic  # what is checked: its value, and `passes` as limit
     quality: Quality
+    value: float
     passes: float  # up to which it passes
     poor: float  # up to which it is poor
-    cause: Diagnostic | None = None  # the motion that was too small
-
-    @property
-    def value(self) -> float:
-        """Of the diagnostic; NaN where it has none."""
-        return float("nan") if self.diagnostic.value is None else self.diagnostic.value
+    cause: Diagnostic | None  # the motion that was too small
 
     @property
     def excess(self) -> float:
@@ -226,7 +222,8 @@ def _check(
     sign = -1.0 if passes > poor else 1.0
     quality = quality or ("fail" if sign * value > sign * poor else "poor" if sign * value > sign * passes else "pass")
     diagnostic = Diagnostic(code, SEVERITY[quality], place, value, float(passes), facts or {})
-    return Check(diagnostic, quality, *limits, None if cause is None else replace(cause, severity=SEVERITY[quality]))
+    cause = None if cause is None else replace(cause, severity=SEVERITY[quality])
+    return Check(diagnostic, quality, value, *limits, cause)
 
 
 def _check_labels(calibration: Calibration) -> Check:
