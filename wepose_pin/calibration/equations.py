@@ -38,7 +38,7 @@ from ..body.mounts import find_start_pose
 from ..body.soft_tissue import LEAST_TWIST_COSINE
 from ..body.subject import Subject
 from ..errors import BadSubject
-from ..observations.expressions import (
+from ..observations import (
     ZERO_LENGTH,
     about_z,
     express_covariance,

@@ -10,7 +10,7 @@ minima are found by Gauss-Newton from many starts at once. A sample with large r
 apart for half of the phase, and a pose may be wrong.
 
 Two neighbours both measure the acceleration of the joint between them, with levers that are constant and estimated with
-the heading (`observations.joint_accelerations`). It separates what the closure confuses: soft tissue that rotates the
+the heading (`linearize_joint`). It separates what the closure confuses: soft tissue that rotates the
 torso's sensor sideways as the torso leans forwards has the same effect on the closure as a heading, but none on a
 joint's acceleration, since orientation and specific force are the sensor's.
 """
@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.tree import UNIVERSE
 from ..filters.butterworth import band_pass
-from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, find_neighbours, linearize_joint
+from ..observations import BAND_HZ, LEAST_RATE_HZ, compute_sides, find_neighbours, linearize_joint
 from ..recording import Recording
 from .equations import Gaussian, Layout
 from .least_squares import LEAST_CORRELATION_S, LeastSquares

@@ -29,7 +29,7 @@ from ..body.table import ZERO, Vector, check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, BadSession, one_of
 from ..libraries import asset
-from ..observations.expressions import PointPath
+from ..observations import PointPath
 from ..recording import Recording
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")

@@ -37,8 +37,7 @@ from ..body.table import HingeJoint
 from ..calibration import load_protocol
 from ..errors import BadSession
 from ..filters.noise import SensorNoise
-from ..observations.expressions import PointPath, find_hinges, linearize_hinge
-from ..observations.joint_accelerations import LEAST_RATE_HZ, find_joint_pairs, linearize_joint
+from ..observations import LEAST_RATE_HZ, PointPath, find_hinges, find_joint_pairs, linearize_hinge, linearize_joint
 from ..recording import Recording
 
 CLASP = "clasp"  # the phase in which the palms are joined, and its protocol

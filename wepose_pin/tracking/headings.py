@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..filters.butterworth import filter_chunk, settle_band_pass
-from ..observations.joint_accelerations import BAND_HZ, compute_sides
+from ..observations import BAND_HZ, compute_sides
 from .heading_filter import HeadingFilter, symmetric
 
 E_Z = np.array([0.0, 0.0, 1.0])
