@@ -1,8 +1,8 @@
-"""Soft tissue turns a sensor on its segment: a person's means, which are corrected, and what varies beyond them."""
+"""The size of a person's errors by the person's own data; soft tissue: its means, which are corrected, and the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ..compilation import kernel
 from ..rotations import product, rotate_by_vector
 from .body import BodyModel
-from .table import ZERO, SoftTissue
+from .table import ZERO, BodyTable, SoftTissue
 
 # Least squared cosine of half the angle between long axes at which the twist between them counts in full.
 LEAST_TWIST_COSINE = 0.1
@@ -18,6 +18,11 @@ LEAST_TWIST_COSINE = 0.1
 # logarithm scatters. The logarithm of a person's size of soft tissue has a standard deviation among people, assumption.
 USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(5.3), 0.25
 SCATTER_LOG_STD = 0.5
+# Of simulated people, as shares of what the table states, geometric mean: the tilts of their segments in the start pose.
+# How far the logarithm of a person's scatters, and, assumption, that of a segment against the person's own.
+USUAL_POSE_SHARE, POSE_LOG_STD = 0.78, 0.35
+SHOWN = 0.5  # times its standard deviation among people, to which the motion must show a tilt
+LEAST_POSE_SHARE = 0.3  # nobody stands more exactly
 
 
 def estimate_scatter(hinge_stds: Collection[float]) -> float:
@@ -29,6 +34,23 @@ def estimate_scatter(hinge_stds: Collection[float]) -> float:
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + HINGE_LOG_STD**2)
     return float(np.exp(weight * np.mean(np.log(np.array([*hinge_stds]) / USUAL_HINGE_STD))))
+
+
+def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> float:
+    """Estimate how far a person is off the start pose, as a share of that among all people.
+
+    It follows from the tilts that the motion shows, as those of arms by their hinges, by empirical Bayes. `offsets` is
+    `Subject.start_pose_offset`.
+    """
+    squares = []
+    for name, (x, y, std) in offsets.items():
+        var = np.square(table.segments[name].start_std[:2])
+        if std < SHOWN * np.sqrt(np.mean(var)):
+            squares.append((x**2 + y**2) / (np.square(table.segments[name].start_mean[:2]) + var).sum())
+    if not squares or table.is_mechanism:
+        return 1.0
+    weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + POSE_LOG_STD**2)
+    return max(float((np.sqrt(np.mean(squares)) / USUAL_POSE_SHARE) ** weight), LEAST_POSE_SHARE)
 
 
 def make_personal(tissue: SoftTissue, share: float, lag: float, scatter: float) -> SoftTissue:

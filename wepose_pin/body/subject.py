@@ -17,7 +17,7 @@ from ..documents import Key, TomlTable, format_record, format_toml, read_record,
 from ..errors import BadData, BadModel, BadOption, BadSubject
 from .body import BodyModel
 from .girdle import PARAMETERS
-from .soft_tissue import estimate_scatter, make_personal
+from .soft_tissue import estimate_pose_share, estimate_scatter, make_personal
 from .table import BodyTable, Segment, compute_population_lengths, load_table
 
 # A row of a covariance, other than lengths.
@@ -180,7 +180,8 @@ class Subject:
 
         A hinge shows how far the sensor above it lags behind a twist. The share of the usual lag that it has is
         assumed for all soft tissue. The axis of a hinge also shows how far the person twists the segment above it, and
-        what hangs on that, in the start pose. How well the hinges hold shows how far all of this varies.
+        what hangs on that, in the start pose. How well the hinges hold shows how far soft tissue varies, and the tilts
+        in the start pose how exactly the person stood.
         """
         segments, hinges, personal = body.table.segments, body.table.hinges, dict[str, Segment]()
         shown = {hinges[joint].on: joint for joint, hinge in self.hinges.items() if hinge.twist_lag is not None}
@@ -190,6 +191,7 @@ class Subject:
         share = sum(self.hinges[joint].twist_lag or 0.0 for joint in shown.values()) / usual
         share = min(max(share, 0.0), MOST_TISSUE_SHARE)
         scatter = estimate_scatter([hinge.std for hinge in self.hinges.values()])
+        pose_share = estimate_pose_share(self.start_pose_offset, body.table)
         for name, segment in segments.items():
             lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
             start_var, carrier = segment.start_std[2] ** 2 - segment.start_mean[2] ** 2, body.parents.get(name)
@@ -205,6 +207,8 @@ class Subject:
                 plane_var = (scatter * HINGE_PLANE_STD) ** 2
                 weight = start_var / (start_var + plane_var)
                 start, start_var = float(weight * angle), weight * plane_var
+            else:
+                start_var *= pose_share**2
             personal[name] = segment._replace(
                 soft_tissue=make_personal(segment.soft_tissue, share, lag, scatter),
                 start_mean=(*segment.start_mean[:2], start),

@@ -67,6 +67,7 @@ class CalibrationProblem:
     # diagnostics of mounts that are not used, as gravity or the motion contradicts them
     unused_mounts: tuple[Diagnostic, ...] = ()
     exchanged: Mapping[str, str] = field(default_factory=dict)  # segment → label of the sensor on it, where they differ
+    pose_share: float = 1.0  # of how far people are off the start pose (`estimate_pose_share`)
 
     @property
     def protocol(self) -> Protocol:
@@ -119,11 +120,11 @@ class CalibrationProblem:
         """
         recording, own, mount = self.recording, self.model.table.segments[segment], self.mount(segment)
         R_start = self.layout.start_pose.rotation(segment)
-        start_cov = R_start @ np.diag(np.square(own.start_std)) @ R_start.T
+        start_cov = self.pose_share**2 * R_start @ np.diag(np.square(own.start_std)) @ R_start.T
         mean, information = np.zeros(3), np.zeros((3, 3))
         information[:2, :2], information[2, 2] = np.linalg.inv(start_cov[:2, :2]), HEADING_STD**-2
         if recording.start_pose == NEUTRAL_POSE:
-            mean[:2] = own.start_mean[:2]
+            mean[:2] = self.pose_share * np.array(own.start_mean[:2])
         if mount is None:
             return mean, information
         heading = [0.0, 0.0, self.stated_headings[segment]]

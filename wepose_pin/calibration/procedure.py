@@ -33,7 +33,7 @@ from ..arguments import Positive, check_arguments
 from ..body import BodyModel, BodyTable, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
 from ..body.girdle import PARAMETERS
-from ..body.soft_tissue import estimate_scatter
+from ..body.soft_tissue import estimate_pose_share, estimate_scatter
 from ..body.subject import Hinge, Subject, girdle_rows, mount_rows, population_subject
 from ..body.table import check_segments
 from ..diagnostics import INFO, WARNING, Diagnostic
@@ -207,8 +207,9 @@ def solve_plausible(problem: CalibrationProblem) -> Calibration:
     if best.problem.exchanged:
         subject = replace(stated.subject, note="sensors sit elsewhere than labelled")
         return replace(stated, subject=subject, remarks=(), exchanged=best.problem.exchanged)
+    pose_share = estimate_pose_share(best.subject.start_pose_offset, problem.model.table)
     try:
-        return solve_problem(best.problem)
+        return solve_problem(replace(best.problem, pose_share=pose_share))
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error
 
