@@ -18,8 +18,8 @@ LEAST_TWIST_COSINE = 0.1
 # logarithm scatters. The logarithm of a person's size of soft tissue has a standard deviation among people, assumption.
 USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(5.3), 0.25
 SCATTER_LOG_STD = 0.5
-# Of simulated people, as a share of what the table states, geometric mean: the tilts of their arms in the start pose. Its
-# logarithm scatters, and, assumption, that of a segment against the person's own does.
+# Of simulated people, as a share of what the table states, geometric mean: the tilts of their arms in the start pose.
+# Its logarithm scatters, and, assumption, that of a segment against the person's own does.
 USUAL_POSE_SHARE, POSE_LOG_STD = 0.78, 0.35
 SHOWN = 0.5  # times its standard deviation among people, to which the motion must show a tilt
 LEAST_POSE_SHARE = 0.3  # nobody stands more exactly
