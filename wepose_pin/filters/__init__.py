@@ -16,30 +16,20 @@ from ..errors import BadData, BadOption, BadPhase, WeposeWarning
 from ..recording import ImuSensor, Recording
 from ..recording.faults import check_arrays, find_gyro_range, find_largest
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
-from .amekf import AmekfParams
-from .base import Orientation, join_orientations
-from .complementary import GdcParams, NcfParams
-from .noise import TYPICAL, SensorNoise, estimate_noise
-from .sensors import BEST, METHODS, OFFLINE, STATIC_ONLY, SensorFilters, check_method
-from .smekf import SmekfParams
+from .amekf import AmekfParams as AmekfParams
+from .base import Orientation as Orientation
+from .base import join_orientations as join_orientations
+from .complementary import GdcParams as GdcParams
+from .complementary import NcfParams as NcfParams
+from .noise import TYPICAL, estimate_noise
+from .sensors import BEST as BEST
+from .sensors import METHODS as METHODS
+from .sensors import OFFLINE as OFFLINE
+from .sensors import STATIC_ONLY as STATIC_ONLY
+from .sensors import SensorFilters as SensorFilters
+from .sensors import check_method as check_method
+from .smekf import SmekfParams as SmekfParams
 from .static import StaticTest
-
-__all__ = [
-    "BEST",
-    "METHODS",
-    "OFFLINE",
-    "STATIC_ONLY",
-    "TYPICAL",
-    "AmekfParams",
-    "GdcParams",
-    "NcfParams",
-    "Orientation",
-    "SensorFilters",
-    "SmekfParams",
-    "check_method",
-    "estimate_orientation",
-    "join_orientations",
-]
 
 
 def estimate_orientation(
@@ -120,10 +110,8 @@ def estimate_orientation(
         raise BadOption(f"rate_hz = {rate_hz} and static = {static}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
-    for name, values, most, unit in (
-        ("gyro_S", gyro, HIGHEST_RATE, "rad/s"),
-        ("accel_S", accel, HIGHEST_ACCEL, "m/s^2"),
-    ):
+    limits = ("gyro_S", gyro, HIGHEST_RATE, "rad/s"), ("accel_S", accel, HIGHEST_ACCEL, "m/s^2")
+    for name, values, most, unit in limits:
         largest = find_largest(values)
         if not largest < np.inf:  # NaN
             raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
@@ -132,14 +120,11 @@ def estimate_orientation(
                 f"{name} has a value of {largest:.6g}: no sensor measures above {most:g} {unit}; check the unit"
             )
     check_arrays("", rate_hz, {"": (gyro, accel)})
-    noise: SensorNoise = TYPICAL
-    start = None
-    diagnostics: tuple[Diagnostic, ...] = ()
+    noise, start, diagnostics = TYPICAL, None, tuple[Diagnostic, ...]()
     if static is None:
         facts = {"method": method} | ({"variant": "estimated"} if method in ("amekf", "smoother") else {})
-        missing = Diagnostic("static-phase-missing", WARNING, facts=facts)
-        diagnostics = (missing,)
-        warnings.warn(join_text(render(missing)), WeposeWarning, stacklevel=2)
+        diagnostics = (Diagnostic("static-phase-missing", WARNING, facts=facts),)
+        warnings.warn(join_text(render(diagnostics[0])), WeposeWarning, stacklevel=2)
     else:
         first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
         if not 0 <= first < last <= len(gyro) + 1:

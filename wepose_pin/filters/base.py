@@ -66,8 +66,7 @@ class Orientation(NamedTuple):
 
     def sampled(self) -> dict[str, Any]:
         """Name → values of each sample, of those that the filter has."""
-        named = {name: getattr(self, name) for name in _SAMPLED}
-        return {name: values for name, values in named.items() if values is not None}
+        return {name: values for name, values in self._asdict().items() if isinstance(values, np.ndarray)}
 
     def __repr__(self) -> str:
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
@@ -76,9 +75,6 @@ class Orientation(NamedTuple):
 
     def _repr_html_(self) -> str:
         return notebook_html(self, self.diagnostics)
-
-
-_SAMPLED = ("quat_VS", "gyro_bias", "static", "attitude_cov", "about_vertical")
 
 
 def join_orientations(parts: Sequence[Orientation]) -> Orientation:

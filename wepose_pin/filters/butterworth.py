@@ -1,15 +1,10 @@
-"""Butterworth filters of second order: forwards and backwards, so that nothing is delayed, or as samples come.
-
-The same as `butter`, `sosfiltfilt` and `sosfilt` of SciPy, whose `scipy.signal` takes half a second to load.
-"""
+"""Butterworth filters of second order as `butter`, `sosfiltfilt` and `sosfilt` of SciPy, which takes 0.5 s to load."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..compilation import kernel
-
-_PAD = 3  # times the length of the filter, by which the signal is continued beyond its ends
 
 
 def low_pass(values: np.ndarray, cutoff_hz: float, rate_hz: float, pad: int | None = None) -> np.ndarray:
@@ -54,8 +49,7 @@ def _design(band_hz: tuple[float | None, float], rate_hz: float) -> np.ndarray:
 
 def _filter_both_ways(sections: np.ndarray, values: np.ndarray, pad: int | None = None) -> np.ndarray:
     n, columns = len(values), values.reshape(len(values), -1)
-    if pad is None:
-        pad = _PAD * (2 * len(sections) + 1)
+    pad = 3 * (2 * len(sections) + 1) if pad is None else pad
     if n <= pad:
         raise ValueError(f"{n} samples, and more than {pad} are needed")
     first, last = 2.0 * columns[0] - columns[pad:0:-1], 2.0 * columns[-1] - columns[-2 : -pad - 2 : -1]

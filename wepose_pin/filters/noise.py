@@ -82,9 +82,7 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
         raise BadPhase(f"the static phase holds {n} samples; at least 10 are needed to measure noise")
     gravity = float(np.linalg.norm(accel_S, axis=1).mean())
     if not gravity > 0.0:
-        raise BadPhase(
-            "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up when static"
-        )
+        raise BadPhase("the static phase holds no gravity: accel is zero; specific force is needed, +g up when static")
     size = max(1, round(BLOCK_S * rate_hz))
     blocks, gyro_cov = n // size, _compute_cov(gyro_S)
     # Means of blocks average white noise out and keep sway; less than four show none.
@@ -109,9 +107,8 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
 def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray | None) -> np.ndarray:
     """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's means over blocks of `size` samples by sway.
 
-    It is the `measured` one with `SWAY_RATE_STD` as a prior of `PRIOR_BLOCKS` blocks, or without the prior where the
-    means vary like white noise. A phase of less than two seconds gives no estimate (half a sway looks like a steady
-    rotation): the result is `SWAY_RATE_STD`.
+    It is the `measured` one with `SWAY_RATE_STD` as a prior, or without it where the means vary like white noise. A
+    phase of less than two seconds gives no estimate: half a sway looks like a steady rotation.
     """
     if measured is None:
         return SWAY_RATE_STD**2 * np.eye(3)
@@ -161,8 +158,9 @@ def estimate_start_tilt(
     across = force - (force @ mean)[:, None] * mean / norm**2
     size = max(1, round(BLOCK_S * rate_hz))
     blocks = len(across) // size
-    if blocks >= 4:
-        variance = float(average_blocks(across, size).var(axis=0, ddof=1).sum()) / 2.0 / blocks
-    else:  # too short for sway to average out
-        variance = float(across.var(axis=0).sum()) / 2.0
+    # In less than four blocks sway does not average out.
+    scatter, count = (
+        (average_blocks(across, size).var(axis=0, ddof=1), blocks) if blocks >= 4 else (across.var(axis=0), 1)
+    )
+    variance = float(scatter.sum()) / 2.0 / count
     return rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm))
