@@ -64,8 +64,7 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
     steps = np.diff(time)
     step = float(np.median(steps))
     if not SHORTEST_STEP_S <= step <= LONGEST_STEP_S:
-        pace = "slower" if step > LONGEST_STEP_S else "faster"
-        unit = guess_time_unit(step) if step > LONGEST_STEP_S else None
+        pace, unit = ("slower", guess_time_unit(step)) if step > LONGEST_STEP_S else ("faster", None)
         guess = f'; time_unit = "{unit}" would fit' if unit else "; is it in seconds?"
         raise BadData(f"{place}: time grows by {step:g} s from row to row, {pace} than any body sensor{guess}")
     wide = np.flatnonzero(steps > (1.0 + UNEVEN) * step)
@@ -178,7 +177,7 @@ def _compute_drift(time: np.ndarray) -> float:
 
 def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
     """Mark every sample (n,) as `GOOD`, `BRIDGED` or `LONG`, by the length of the runs that are not `good` (n,)."""
-    marks = np.zeros(len(good), dtype=np.int8)
+    marks = np.full(len(good), GOOD, dtype=np.int8)
     for first, last in find_runs(~good):
         marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
     return marks

@@ -106,9 +106,10 @@ def check_sensors(
 
 def check_arrays(place: str, rate_hz: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Raise `BadData` where a sensor does not measure; `samples`: sensor → gyro and accel (n, 3), all numbers."""
-    if not any(may_have_faults(np.ascontiguousarray(values)) for arrays in samples.values() for values in arrays):
+    floats = {name: [np.ascontiguousarray(each, dtype=float) for each in arrays] for name, arrays in samples.items()}
+    if not any(may_have_faults(values) for arrays in floats.values() for values in arrays):
         return
-    times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in samples.items()}
+    times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in floats.items()}
     for name, faults in find_faults(times).items():
         text = faults[0].describe(max(faults[0].first, 0.0))
         raise BadData(f"{place}{name}{': ' * bool(name)}{text}: it does not measure there; leave these samples out")

@@ -30,13 +30,12 @@ def check_time(where: str, time: np.ndarray) -> None:
         raise BadData(f"{where}: time: not a finite number in row {bad[0] + 1}; every row needs its time in seconds")
     back = np.flatnonzero(time[1:] <= time[:-1])
     if back.size:
-        k = int(back[0])
-        if time[k + 1] == time[k]:
+        k, before, after = back[0], *time[back[0] : back[0] + 2]
+        fault, remedy = "goes back", "sort the rows by time, or cut the recording there"
+        if before == after:
             fault, remedy = "stands still", "delete one of the two rows"
-        else:
-            fault, remedy = "goes back", "sort the rows by time, or cut the recording there"
         raise BadData(
-            f"{where}: time {fault} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
+            f"{where}: time {fault} in row {k + 2}: {format_time(after, 6)} s after {format_time(before, 6)} s; "
             f"it must grow in every row: {remedy}"
         )
 
@@ -76,9 +75,8 @@ def select_interval(
 ) -> tuple[float, float] | None:
     """Return the interval [s] that --interval or --phase selects; None: neither is given.
 
-    `time` (n,) [s]: the interval may exceed it by `MOST_BEYOND` samples at each end. `phases`: name → intervals [s]; of
-    a phase with several intervals ``NAME:2`` is the second. `WrongOption`: both are given; the interval is outside the
-    recording; there is no such phase, or it has several intervals.
+    It may exceed `time` (n,) [s] by `MOST_BEYOND` samples at each end. Of a phase with several intervals ``NAME:2`` is
+    the second. `WrongOption`: both are given; the interval is outside the recording; there is no such phase or number.
     """
     check_selection(interval, phase)
     if phase is None:

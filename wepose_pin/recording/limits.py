@@ -17,14 +17,9 @@ LARGEST_NUMBER = 1e30
 NARROWEST_GYRO_RANGE = 2.0  # [rad/s]
 NARROWEST_ACCEL_RANGE = 15.0  # [m/s²]
 
-# Relative error of a static accelerometer's mean norm against gravity. Data sheets of MEMS sensors state scale errors
-# of 1 to 3 %; the published OpenAXES sensors on a robot show 3 %. An error of 20 % means another unit, or no gravity.
-GRAVITY_ERROR_NOTED = 0.06
-GRAVITY_ERROR_REFUSED = 0.2
 # Plausible median specific force [m/s²] of a recording: free fall or 30 g do not last for half of it.
 MEDIAN_FORCE = (3.0, 300.0)
 
-# [s] longest step between samples of a body-worn sensor; a longer step means that the times are in another unit.
-LONGEST_STEP_S = 0.5
-# [s] shortest one; MEMS sensors give at most 32 kHz (TDK ICM-42688).
-SHORTEST_STEP_S = 1e-6
+# [s] between samples of a body-worn sensor: a longer step means that the times are in another unit; MEMS sensors give
+# at most 32 kHz (TDK ICM-42688).
+LONGEST_STEP_S, SHORTEST_STEP_S = 0.5, 1e-6
