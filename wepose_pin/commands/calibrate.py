@@ -9,19 +9,8 @@ from typing import Annotated, Any, Literal
 
 from ..diagnostics import lines
 from ..errors import WrongOption
-from .options import (
-    RESEARCH,
-    Force,
-    Formulation,
-    Measured,
-    Method,
-    Model,
-    Out,
-    ProtocolName,
-    Stature,
-    Subject,
-    described_by,
-)
+from . import options as opt
+from .options import described_by
 from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
@@ -32,18 +21,18 @@ def calibrate(
     session: Path,
     /,
     *,
-    out: Out,
-    measured: Measured | None = None,
-    stature: Stature | None = None,
+    out: opt.Out,
+    measured: opt.Measured | None = None,
+    stature: opt.Stature | None = None,
     sex: Literal["f", "m"] | None = None,
-    protocol: ProtocolName | None = None,
-    model: Model | None = None,
-    prior: Subject | None = None,
+    protocol: opt.ProtocolName | None = None,
+    model: opt.Model | None = None,
+    prior: opt.Subject | None = None,
     gaps: bool = False,
     report: bool = True,
-    force: Force = False,
-    method: Annotated[Method, RESEARCH] = "amekf",
-    formulation: Annotated[Formulation, RESEARCH] = "full",
+    force: opt.Force = False,
+    method: Annotated[opt.Method, opt.RESEARCH] = "amekf",
+    formulation: Annotated[opt.Formulation, opt.RESEARCH] = "full",
 ) -> Outcome:  # of a Calibration
     """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
 

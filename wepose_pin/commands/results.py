@@ -8,22 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..diagnostics import Diagnostic
 from ..errors import BadOption, MissingFile, WrongOption
-from .options import (
-    MORE,
-    Angle,
-    ExportHz,
-    File,
-    Force,
-    Hz,
-    Interval,
-    Name,
-    Out,
-    OutFile,
-    PhaseName,
-    Seconds,
-    Text,
-    described_by,
-)
+from . import options as opt
+from .options import described_by
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
@@ -38,11 +24,11 @@ def view(
     result: Path,
     /,
     *,
-    out: OutFile | None = None,
+    out: opt.OutFile | None = None,
     open: bool = True,
-    force: Force = False,
-    interval: Annotated[Interval | None, MORE] = None,
-    phase: Annotated[PhaseName | None, MORE] = None,
+    force: opt.Force = False,
+    interval: Annotated[opt.Interval | None, opt.MORE] = None,
+    phase: Annotated[opt.PhaseName | None, opt.MORE] = None,
 ) -> Path:
     """Show the motion of a result as one HTML page that opens offline.
 
@@ -90,12 +76,12 @@ def evaluate(
     truth: Path,
     /,
     *,
-    interval: Interval | None = None,
-    phase: PhaseName | None = None,
-    align: Annotated[bool, MORE] = True,
-    fit: Annotated[Literal["world", "segments"] | None, MORE] = None,
-    time_offset: Annotated[Seconds | None, MORE] = None,
-    markers: Annotated[File | None, MORE] = None,
+    interval: opt.Interval | None = None,
+    phase: opt.PhaseName | None = None,
+    align: Annotated[bool, opt.MORE] = True,
+    fit: Annotated[Literal["world", "segments"] | None, opt.MORE] = None,
+    time_offset: Annotated[opt.Seconds | None, opt.MORE] = None,
+    markers: Annotated[opt.File | None, opt.MORE] = None,
 ) -> Any:  # an Evaluation, whose room loads late
     """Compare a result with a reference: attitude, drift, joint angles, positions, stated uncertainty.
 
@@ -235,14 +221,14 @@ def angles(
     result: Path,
     /,
     *further: Path,
-    out: Out,
-    interval: Interval | None = None,
-    phase: PhaseName | None = None,
-    low_pass_hz: Hz | None = None,
-    force: Force = False,
-    repetitions: Annotated[PhaseName | None, MORE] = None,
-    main_angle: Annotated[Angle | None, MORE] = None,
-    shoulder: Annotated[Literal["auto", "YXY", "XZY", "ZXY"], MORE] = "auto",
+    out: opt.Out,
+    interval: opt.Interval | None = None,
+    phase: opt.PhaseName | None = None,
+    low_pass_hz: opt.Hz | None = None,
+    force: opt.Force = False,
+    repetitions: Annotated[opt.PhaseName | None, opt.MORE] = None,
+    main_angle: Annotated[opt.Angle | None, opt.MORE] = None,
+    shoulder: Annotated[Literal["auto", "YXY", "XZY", "ZXY"], opt.MORE] = "auto",
 ) -> None:
     """Write the joint angles of results as tables and figures for a paper.
 
@@ -337,16 +323,16 @@ def export(
     result: Path,
     /,
     *further: Path,
-    out: OutFile,
-    format: Name | None = None,
-    rate_hz: ExportHz | None = None,
-    interval: Interval | None = None,
-    phase: PhaseName | None = None,
-    force: Force = False,
-    names: Annotated[Literal["isb", "opensim"] | None, MORE] = None,
-    osim_model: Annotated[File | None, MORE] = None,
-    episodes: Annotated[PhaseName | None, MORE] = None,
-    instruction: Annotated[Text | None, MORE] = None,
+    out: opt.OutFile,
+    format: opt.Name | None = None,
+    rate_hz: opt.ExportHz | None = None,
+    interval: opt.Interval | None = None,
+    phase: opt.PhaseName | None = None,
+    force: opt.Force = False,
+    names: Annotated[Literal["isb", "opensim"] | None, opt.MORE] = None,
+    osim_model: Annotated[opt.File | None, opt.MORE] = None,
+    episodes: Annotated[opt.PhaseName | None, opt.MORE] = None,
+    instruction: Annotated[opt.Text | None, opt.MORE] = None,
 ) -> Any:  # an Exported, whose room loads late
     """Write the motion of a person or of a robot for other programs: OpenSim, BVH, C3D, LeRobot, ROS 2 and others.
 

@@ -7,21 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ..diagnostics import from_json
-from .options import (
-    MORE,
-    Arms,
-    Factor,
-    Force,
-    Hz,
-    Interval,
-    Out,
-    PhaseName,
-    Radians,
-    RobotHz,
-    RobotName,
-    Share,
-    described_by,
-)
+from . import options as opt
+from .options import described_by
 from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 
@@ -30,20 +17,20 @@ def retarget(
     result: Path,
     /,
     *,
-    robot: RobotName,
-    out: Out,
-    arm: Arms | None = None,
-    rate_hz: RobotHz = 100.0,
-    interval: Interval | None = None,
-    phase: PhaseName | None = None,
+    robot: opt.RobotName,
+    out: opt.Out,
+    arm: opt.Arms | None = None,
+    rate_hz: opt.RobotHz = 100.0,
+    interval: opt.Interval | None = None,
+    phase: opt.PhaseName | None = None,
     view: bool = True,
     report: bool = True,
-    force: Force = False,
-    task: Annotated[Literal["both", "position", "orientation"], MORE] = "both",
-    scale: Annotated[Factor | None, MORE] = None,
-    smoothing_hz: Annotated[Hz, MORE] = 6.0,
-    speed_scale: Annotated[Share | None, MORE] = None,
-    limit_margin: Annotated[Radians | None, MORE] = None,
+    force: opt.Force = False,
+    task: Annotated[Literal["both", "position", "orientation"], opt.MORE] = "both",
+    scale: Annotated[opt.Factor | None, opt.MORE] = None,
+    smoothing_hz: Annotated[opt.Hz, opt.MORE] = 6.0,
+    speed_scale: Annotated[opt.Share | None, opt.MORE] = None,
+    limit_margin: Annotated[opt.Radians | None, opt.MORE] = None,
 ) -> Outcome:  # of what summary.json holds
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 

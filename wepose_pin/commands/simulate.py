@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ..errors import BadOption, one_of
+from . import options as opt
 from .calibrate import calibrate
-from .options import MORE, RESEARCH, Duration, Force, Imperfection, Out, ProtocolName, SampleHz, Seed
 from .output import progress_bar, say
 from .results import evaluate
 from .track import track
@@ -21,15 +21,15 @@ CIRCLES = 6  # drawn by the right hand after the protocol
 
 def simulate(
     *,
-    out: Out,
-    seed: Seed = 1,
-    seconds: Duration | None = None,
-    protocol: ProtocolName | None = None,
+    out: opt.Out,
+    seed: opt.Seed = 1,
+    seconds: opt.Duration | None = None,
+    protocol: opt.ProtocolName | None = None,
     activity: Literal["walk", "sit", "tasks", "run", "throw"] | None = None,
     preset: Literal["ideal", "mild", "people"] = "ideal",
-    force: Force = False,
-    rate_hz: Annotated[SampleHz, MORE] = 100.0,
-    imperfection: Annotated[Imperfection | None, RESEARCH] = None,
+    force: opt.Force = False,
+    rate_hz: Annotated[opt.SampleHz, opt.MORE] = 100.0,
+    imperfection: Annotated[opt.Imperfection | None, opt.RESEARCH] = None,
 ) -> Any:  # the Person, whose room loads late
     """Simulate the recording of a person with five sensors, or fifteen on the whole body, and its known truth.
 
@@ -128,7 +128,7 @@ def simulate(
     return person
 
 
-def demo(*, out: Out = Path("wepose-demo"), seed: Seed = 1, force: Force = False) -> None:
+def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.Force = False) -> None:
     """Run the commands simulate, calibrate, track and evaluate, one after the other.
 
     A person of random size wears five Xsens MTi-3, stands in the N-pose, moves the joined hands and holds the T-pose, a

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ..diagnostics import from_json
-from .options import MORE, RESEARCH, Force, Method, Model, Out, Subject, described_by
+from . import options as opt
+from .options import described_by
 from .output import print_diagnostics, progress_bar, say, say_pages, say_paragraph
 
 
@@ -16,20 +17,20 @@ def track(
     session: Path,
     /,
     *,
-    out: Out,
-    subject: Subject | None = None,
-    method: Method | None = None,
-    model: Model | None = None,
+    out: opt.Out,
+    subject: opt.Subject | None = None,
+    method: opt.Method | None = None,
+    model: opt.Model | None = None,
     gaps: bool = False,
     view: bool = True,
     report: bool = True,
-    force: Force = False,
-    accept_failed: Annotated[bool, MORE] = False,
-    covariance: Annotated[bool, MORE] = False,
-    torques: Annotated[bool, MORE] = False,
-    causal: Annotated[bool, RESEARCH] = False,
-    open_loop: Annotated[bool, RESEARCH] = False,
-    limits: Annotated[bool, RESEARCH] = True,
+    force: opt.Force = False,
+    accept_failed: Annotated[bool, opt.MORE] = False,
+    covariance: Annotated[bool, opt.MORE] = False,
+    torques: Annotated[bool, opt.MORE] = False,
+    causal: Annotated[bool, opt.RESEARCH] = False,
+    open_loop: Annotated[bool, opt.RESEARCH] = False,
+    limits: Annotated[bool, opt.RESEARCH] = True,
 ) -> Mapping[str, Any]:  # as in summary.json
     """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
 

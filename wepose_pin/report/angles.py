@@ -11,19 +11,8 @@ import polars as pl
 from ..angles import Angles, group_sides
 from ..angles.movement import MEASURES, Movement
 from ..angles.repetitions import PERCENT, list_angles
-from .figures import (
-    BAND,
-    SESSION_COLOURS,
-    SHADE,
-    SOFT,
-    Figures,
-    ReportFigure,
-    draw_over_time,
-    envelope,
-    line_style,
-    shade,
-    styled,
-)
+from . import figures as fig
+from .figures import Figures, ReportFigure, styled
 from .page import MOST_FIGURES, render_page
 from .words import Table, number, plain, plus_minus
 
@@ -31,7 +20,7 @@ HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # 
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
 SESSIONS: list[dict[str, Any]] = [  # lines of the sessions, in turn
     {"color": colour, "linestyle": dashes}
-    for colour, dashes in zip(SESSION_COLOURS, ("-", "--", ":", "-."), strict=True)
+    for colour, dashes in zip(fig.SESSION_COLOURS, ("-", "--", ":", "-."), strict=True)
 ]
 ADVICE = (
     "State another angle by `--main-angle`, a time by `--interval`, or mark repetitions as intervals of a phase and "
@@ -189,10 +178,10 @@ def draw_joint_angles(angles: Angles, caption: str = "Joint angles over time.") 
         for k, name in enumerate(angles[next(iter(members.values()))].names):
             lines = {side: np.where(angles[j].hidden(k), np.nan, angles[j].values[:, k]) for side, j in members.items()}
             panels[f"{plain(group)}: {plain(name)} [°]"] = {side: np.degrees(line) for side, line in lines.items()}
-        styles |= {side: line_style(side, side) for side in members}
+        styles |= {side: fig.line_style(side, side) for side in members}
     if any((joint.near_lock | joint.gap).any() for joint in angles.joints.values()):
         caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
-    return draw_over_time(angles.time, panels, caption, styles, columns=3)
+    return fig.draw_over_time(angles.time, panels, caption, styles, columns=3)
 
 
 def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure:
@@ -202,11 +191,11 @@ def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure
         spans, source = movement.repetitions.spans, movement.repetitions.source
         joint, place = list_angles(movement.angles)[source]
         ax.set_title(f"{movement.name}: {plain(source)} [°], {len(spans) or 'no'} repetitions")
-        shade(ax, spans[::2], "", SHADE)
-        shade(ax, spans[1::2], "", BAND)
+        fig.shade(ax, spans[::2], "", fig.SHADE)
+        fig.shade(ax, spans[1::2], "", fig.BAND)
         each = movement.angles[joint]
         values = np.degrees(np.where(each.hidden(place), np.nan, each.values[:, place]))
-        ax.plot(*envelope(movement.angles.time, values), **SESSIONS[k % len(SESSIONS)])
+        ax.plot(*fig.envelope(movement.angles.time, values), **SESSIONS[k % len(SESSIONS)])
     figure.axes[-1].set_xlabel("time [s]")
     return figure
 
@@ -228,12 +217,12 @@ def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: 
                 style, curve = SESSIONS[k % len(SESSIONS)], movement.curves[joint][place]
                 mean, sd = np.degrees(curve.mean), np.degrees(curve.sd)
                 if not np.isfinite(mean).any():
-                    ax.text(50.0, 0.0, "not determined (near gimbal lock)", ha="center", color=SOFT)
+                    ax.text(50.0, 0.0, "not determined (near gimbal lock)", ha="center", color=fig.SOFT)
                     continue
                 ax.fill_between(PERCENT, mean - sd, mean + sd, color=style["color"], alpha=0.2, linewidth=0)
                 if alone:
                     each = np.where(np.isfinite(mean), np.degrees(curve.curves[:MOST_CURVES]), np.nan)
-                    ax.plot(PERCENT, each.T, color=SOFT, linewidth=0.3)
+                    ax.plot(PERCENT, each.T, color=fig.SOFT, linewidth=0.3)
                 label = f"{movement.name}, n = {len(movement.repetitions.spans)}"
                 ax.plot(PERCENT, mean, **style, linewidth=1.8, label=label)
     for ax in row:

@@ -11,20 +11,12 @@ from ..diagnostics import from_json
 from ..retargeting import Trajectory
 from ..retargeting.collision import CLEARANCE
 from ..retargeting.files import CAUSES, FAR, find_error_causes
-from .figures import (
-    ALARM,
-    SESSION_COLOURS,
-    SOFT,
-    ReportFigure,
-    draw_over_time,
-    find_spans,
-    line_style,
-    styled,
-)
+from . import figures as fig
+from .figures import ReportFigure, styled
 from .page import Frame, Item, render_page, show_diagnostics
 from .words import Table, number, plain
 
-CAUSE_COLOURS = (ALARM, *SESSION_COLOURS, SOFT)  # of `CAUSES`
+CAUSE_COLOURS = (fig.ALARM, *fig.SESSION_COLOURS, fig.SOFT)  # of `CAUSES`
 
 
 def render_retargeting_report(
@@ -115,7 +107,7 @@ def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Ite
     rows = []
     for j in (j for arm in robot.arms for j in arm.joints.tolist()):
         name, position, limit = robot.names[j], trajectory.joint_position[:, j], limits[robot.names[j]]
-        factor, unit = _choose_unit(limit.kind)
+        factor, unit = (1e3, "mm") if limit.kind == "prismatic" else (180.0 / np.pi, "°")
         margin = factor * float(np.minimum(position - limit.lower, limit.upper - position).min())
         most = limit.velocity, robot.map.acceleration[name], robot.map.jerk[name]
         used = (
@@ -130,10 +122,6 @@ def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Ite
         f"limit (`--limit-margin`). In {100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked, "
         "to keep all limits and a way to stop.",
     ]
-
-
-def _choose_unit(kind: str) -> tuple[float, str]:
-    return (1e3, "mm") if kind == "prismatic" else (180.0 / np.pi, "°")
 
 
 def describe_run(summary: Mapping[str, Any]) -> str:
@@ -152,21 +140,21 @@ def describe_run(summary: Mapping[str, Any]) -> str:
 def draw_hands(trajectory: Trajectory) -> ReportFigure:
     """The distance of each hand from its target, and below why it is far off."""
     time, errors = trajectory.time, _compute_hand_errors(trajectory)
-    figure = draw_over_time(
+    figure = fig.draw_over_time(
         time,
         {f"{side} hand, distance from its target [mm]": {side: error} for side, error in errors.items()},
         f"The dashed line: {1e3 * FAR:g} mm. The bar below: why a hand is farther off than that.",
-        {side: {**line_style(side, side), "label": None, "linestyle": "-"} for side in errors},
+        {side: {**fig.line_style(side, side), "label": None, "linestyle": "-"} for side in errors},
         spans=("approach", [(0.0, float(time[trajectory.approach_samples]))]),
     )
     for i, (ax, error) in enumerate(zip(figure.axes, errors.values(), strict=True)):
         most = 1.08 * max(float(error.max()), 2e3 * FAR)
         ax.set_ylim(-0.16 * most, most)
-        ax.axhline(1e3 * FAR, color=SOFT, linestyle="--", linewidth=0.8)
+        ax.axhline(1e3 * FAR, color=fig.SOFT, linestyle="--", linewidth=0.8)
         cause = find_error_causes(trajectory, i)
         for k, (name, colour) in enumerate(zip(CAUSES, CAUSE_COLOURS, strict=True)):
             if (cause == k).any():
-                bars = [(a, max(b - a, time[1] - time[0])) for a, b in find_spans(time, cause == k)]
+                bars = [(a, max(b - a, time[1] - time[0])) for a, b in fig.find_spans(time, cause == k)]
                 ax.broken_barh(bars, (-0.13 * most, 0.1 * most), facecolor=colour, label=name)
     figure.add_legend()
     return figure

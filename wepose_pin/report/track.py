@@ -6,36 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..angles import Angles, summary
+from ..angles import Angles
+from ..angles import summary as summarize_angles
 from ..body import BodyTable
 from ..body.kinematics import compute_axis_std
 from ..recording import format_span
 from ..tracking import TrackResult, TrackSummary
-from ..tracking.summary import (
-    SOURCES,
-    compute_heading_stds,
-    compute_joint_heading_stds,
-    find_samples_after_start,
-    finite_max,
-    finite_median,
-    has_stated_mounts,
-    longest_run_s,
-    measure_reach,
-)
+from ..tracking import summary as measures
+from . import figures as fig
 from .angles import draw_joint_angles
-from .figures import (
-    ALARM,
-    COLOURS,
-    SOFT,
-    Figures,
-    ReportFigure,
-    draw_over_time,
-    envelope,
-    find_spans,
-    line_style,
-    shade,
-    styled,
-)
+from .figures import Figures, ReportFigure, styled
 from .page import Frame, Item, render_page, show_diagnostics
 from .viewer import compute_angles
 from .words import Table, explain_no_covariance, kinds, listed, name_tips, number, plain, plural, spread
@@ -74,12 +54,12 @@ def render_track_report(summary: TrackSummary, reliance: str, angles: Angles | N
 
 def _describe_recording(tracked: TrackResult) -> str:
     recording, time = tracked.recording, tracked.time
+    mounts = "as the session states them" if measures.has_stated_mounts(tracked) else "as calibrated"
     text = (
         f"{recording.time[-1] - recording.time[0]:.0f} s at {recording.rate_hz:g} Hz from {len(recording.sensors)} "
         f"sensors, {tracked.options['method'] if recording.imus else 'measured orientations'}. Lengths: "
-        f"{plain(tracked.subject.note or tracked.subject.name)}; mounts "
-        f"{'as the session states them' if has_stated_mounts(tracked) else 'as calibrated'}. ± is one standard "
-        "deviation throughout: two times out of three the truth lies within."
+        f"{plain(tracked.subject.note or tracked.subject.name)}; mounts {mounts}. ± is one standard deviation "
+        "throughout: two times out of three the truth lies within."
     )
     if tracked.subject.is_population and not tracked.model.table.is_mechanism:
         text += " `wepose calibrate` measures the lengths of the person."
@@ -88,18 +68,18 @@ def _describe_recording(tracked: TrackResult) -> str:
             f" Angles and positions are shown for {len(time)} samples, one in {len(recording) / len(time):.0f}; "
             "extremes, static phases and losses include all samples."
         )
-    before = float(time[np.argmax(find_samples_after_start(tracked))] - time[0])
+    before = float(time[np.argmax(measures.find_samples_after_start(tracked))] - time[0])
     if before >= 1.0:
         text += f" Each ± is of the time after the start pose; the {before:.0f} s before its end are left out."
     return text
 
 
-def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
+def _list_recorded(tracked: TrackResult, summary: TrackSummary) -> list[Item]:
     rate_hz, rows = tracked.recording.rate_hz, []
     phases = "; ".join(
         f"{name} {', '.join(map(format_span, spans))}" for name, spans in tracked.recording.phases.items()
     )
-    for name, (rate, cut) in measures.signals.items():
+    for name, (rate, cut) in summary.signals.items():
         gap, orientation = tracked.recording.sensors[name].gap, tracked.segments.orientation.get(name)
         lost = 0 if gap is None else np.count_nonzero(gap)
         cells = [f"{np.degrees(rate.max()):.0f} °/s"]
@@ -107,8 +87,8 @@ def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
         if orientation is None:  # measured orientations
             cells += [""] * 5
         else:
-            static, biases = measures.static[name], (orientation.noise.gyro_bias, orientation.gyro_bias[-1])
-            cells += [f"{100 * static.mean():.0f} %", f"{longest_run_s(~static, rate_hz):.0f} s"]
+            static, biases = summary.static[name], (orientation.noise.gyro_bias, orientation.gyro_bias[-1])
+            cells += [f"{100 * static.mean():.0f} %", f"{measures.longest_run_s(~static, rate_hz):.0f} s"]
             cells += [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in biases]
             cells.append(f"{orientation.noise.gravity:.3f} m/s²")
         rows.append([plain(name), *cells])
@@ -118,7 +98,7 @@ def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
     return [
         f"{len(tracked.recording)} samples at {rate_hz:g} Hz, one every {steps} ms."
         f"{f' Phases: {phases}.' if phases else ''}",
-        draw_timeline(measures),
+        draw_timeline(summary),
         Table("", [*header, "bias at first", "bias at the end", "gravity"], rows),
         "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
         "sensor is static its gyroscope measures its bias, and the heading does not drift. An error of 0.1 °/s in the "
@@ -127,10 +107,10 @@ def _list_recorded(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
 
 
 def _list_drift(tracked: TrackResult) -> list[Item]:
-    stds, _ = compute_heading_stds(tracked)
+    stds, _ = measures.compute_heading_stds(tracked)
     if not stds:
         return [explain_no_covariance(tracked)]
-    table, after_start = tracked.model.table, find_samples_after_start(tracked)
+    table, after_start = tracked.model.table, measures.find_samples_after_start(tracked)
     text = (
         "Gravity corrects the tilt. No sensor measures the heading, the rotation about the vertical: it is set in the "
         "start pose and then drifts with the gyroscope's errors."
@@ -142,23 +122,23 @@ def _list_drift(tracked: TrackResult) -> list[Item]:
             "correct errors that all segments share, such as the heading of the whole person."
         )
     rows = []
-    for name, std in [*stds.items(), *compute_joint_heading_stds(stds, tracked.model).items()]:
-        ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
+    for name, std in [*stds.items(), *measures.compute_joint_heading_stds(stds, tracked.model).items()]:
+        ends = measures.finite_median(std[after_start]), measures.finite_max(std[after_start]), std[-1]
         rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends)])
     sides = {side: [name for name in stds if table.side(name) == side] for side in map(table.side, stds)}
-    figure = draw_over_time(
+    figure = fig.draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
         "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
-        {name: line_style(name, side, rank) for side, own in sides.items() for rank, name in enumerate(own)},
+        {name: fig.line_style(name, side, rank) for side, own in sides.items() for rank, name in enumerate(own)},
         spans=("clasp", tracked.recording.phases.get("clasp", ())),
     )
     return [text, figure, Table("", ["segment or joint", "median ±", "largest ±", "± at the end"], rows)]
 
 
-def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
-    table, after_start = tracked.model.table, find_samples_after_start(tracked)
-    reaches, covs = measure_reach(tracked.pose, table), tracked.pose.point_cov
+def _list_tips(tracked: TrackResult, summary: TrackSummary) -> list[Item]:
+    table, after_start = tracked.model.table, measures.find_samples_after_start(tracked)
+    reaches, covs = measures.measure_reach(tracked.pose, table), tracked.pose.point_cov
     items: list[Item] = list(draw_tips(tracked.time, reaches, table).values())
     for title, tips in group_tips(reaches, table).items():
         rows = []
@@ -166,7 +146,7 @@ def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
             low, high = np.nanpercentile(100 * reach, [1.0, 99.0], axis=0)
             ranges = [f"{number(a, 0)} to {number(b, 0)}" for a, b in zip(low, high, strict=True)]
             std = 1e3 * compute_axis_std(covs[name])[after_start] if name in covs else np.full(1, np.nan)
-            stds = [spread(each(std), 0, " mm") for each in (finite_median, finite_max)]
+            stds = [spread(each(std), 0, " mm") for each in (measures.finite_median, measures.finite_max)]
             rows.append([plain(name), *ranges, *stds])
         items.append(Table(f"The {title}", ["", *AXES, "median ±", "largest ±"], rows))
     if not items:
@@ -175,35 +155,35 @@ def _list_tips(tracked: TrackResult, measures: TrackSummary) -> list[Item]:
         "Ranges hold 98 % of the time. The ± is of one axis, relative to the root, and includes the lean and the "
         "lengths of all that lies between."
     )
-    return [*items, *tabulate_error_budget(measures.error_budget)]
+    return [*items, *tabulate_error_budget(summary.error_budget)]
 
 
 def tabulate_error_budget(budget: Mapping[str, Mapping[str, float]]) -> list[Table]:
     """The share of each source of error in the ± of each point; none where no ± is known."""
     rows = []
     for point, shares in budget.items():
-        stds = *(shares.get(source, 0.0) for source in SOURCES), float(np.linalg.norm([*shares.values()]))
+        stds = *(shares.get(source, 0.0) for source in measures.SOURCES), float(np.linalg.norm([*shares.values()]))
         rows.append([plain(point), *(number(1e3 * std, 0) for std in stds)])
     title = "What the ± is made of: root mean square of an axis; the parts add up in squares"
-    return [Table(title, ["", *(f"{source} [mm]" for source in (*SOURCES, "all"))], rows)] if rows else []
+    return [Table(title, ["", *(f"{source} [mm]" for source in (*measures.SOURCES, "all"))], rows)] if rows else []
 
 
 def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
     rows = []
-    for joint, ranges in summary(angles).items():
+    for joint, ranges in summarize_angles(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
             extremes = np.degrees([ranges.lowest[k], ranges.highest[k], ranges.range[k]])
             ends = (number(each, 0, "°", unknown="") for each in extremes)
             rate = number(np.degrees(ranges.peak_rate[k]), 0, " °/s", unknown="")
-            std = spread(np.degrees(finite_median(stds[:, k])) if stds is not None else np.nan, 1, "°")
+            std = spread(np.degrees(measures.finite_median(stds[:, k])) if stds is not None else np.nan, 1, "°")
             near_lock = f"{100 * ranges.near_lock:.0f} %" if k != 1 else ""
             rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, std, near_lock])
     stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
     return [
         "After the International Society of Biomechanics (Wu 2005), left and right with the same signs: an angle named "
         "elevation is negative where the arm is raised, pronation is 90° with the palms at the thighs."
-        f"{stated if has_stated_mounts(tracked) else ''}",
+        f"{stated if measures.has_stated_mounts(tracked) else ''}",
         draw_joint_angles(angles),
         Table("", ["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
         "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
@@ -218,16 +198,16 @@ def draw_figures(result: TrackResult) -> Figures:
     """Draw the paths of the hands and their reach, and the joint angles, of what is known; as `TrackResult.plot`."""
     figures, table = Figures(), result.model.table
     if len(result.time) > 1:
-        figures |= draw_tips(result.time, measure_reach(result.pose, table), table)
+        figures |= draw_tips(result.time, measures.measure_reach(result.pose, table), table)
     if (angles := compute_angles(result.pose)) is not None:
         figures["angles"] = draw_joint_angles(angles)
     return figures
 
 
 @styled
-def draw_timeline(measures: TrackSummary) -> ReportFigure:
+def draw_timeline(summary: TrackSummary) -> ReportFigure:
     """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
-    recording, signals, table = measures.recording, measures.signals, measures.last.model.table
+    recording, signals, table = summary.recording, summary.signals, summary.last.model.table
     time = recording.time
     most = max(1.0, max(float(np.degrees(rate.max())) for rate, _ in signals.values()))
     figure = ReportFigure(
@@ -242,21 +222,21 @@ def draw_timeline(measures: TrackSummary) -> ReportFigure:
     ax.set_xlabel("time [s]")
     ax.grid(axis="y", visible=False)
     for name, spans in recording.phases.items():
-        shade(ax, spans, "phase")
+        fig.shade(ax, spans, "phase")
         for begin, end in spans:
             if 110.0 * (end - begin) / (time[-1] - time[0]) > len(name):  # as many letters are as wide as the plot
                 ax.text(begin, 1.02, f" {name}", fontsize=8)
     for row, (name, (rate, cut)) in enumerate(signals.items()):
-        at, rate = envelope(time, np.degrees(rate))
-        ax.fill_between(at, -row, 0.85 * rate / most - row, color=COLOURS[table.side(name) or "other"], linewidth=0)
+        at, rate = fig.envelope(time, np.degrees(rate))
+        ax.fill_between(at, -row, 0.85 * rate / most - row, color=fig.COLOURS[table.side(name) or "other"], linewidth=0)
         gap = recording.sensors[name].gap
         for mask, label, low, height, look in (
-            (measures.static.get(name), "static", -0.1, 0.07, {"facecolor": "black"}),
-            (gap, "lost and interpolated", 0.0, 0.85, {"facecolor": "none", "edgecolor": SOFT, "hatch": "////"}),
-            (cut, "saturated", 0.85, 0.1, {"facecolor": ALARM, "edgecolor": ALARM, "linewidth": 1.0}),
+            (summary.static.get(name), "static", -0.1, 0.07, {"facecolor": "black"}),
+            (gap, "lost and interpolated", 0.0, 0.85, {"facecolor": "none", "edgecolor": fig.SOFT, "hatch": "////"}),
+            (cut, "saturated", 0.85, 0.1, {"facecolor": fig.ALARM, "edgecolor": fig.ALARM, "linewidth": 1.0}),
         ):
             if mask is not None and mask.any():
-                bars = [(begin, end - begin) for begin, end in find_spans(time, mask)]
+                bars = [(begin, end - begin) for begin, end in fig.find_spans(time, mask)]
                 ax.broken_barh(bars, (low - row, height), label=label, **{"linewidth": 0, **look})
     figure.add_legend()
     return figure
@@ -282,7 +262,7 @@ def draw_tips(time: np.ndarray, tips: Mapping[str, np.ndarray], table: BodyTable
         return {}
     caption = f"The {'; the '.join(groups)}"
     paths = ReportFigure(f"{caption}: paths. A mark shows the beginning.", 2.7 * len(groups))
-    styles = {name: line_style(name, table.side(name)) for name in tips}
+    styles = {name: fig.line_style(name, table.side(name)) for name in tips}
     panels: dict[str, dict[str, np.ndarray]] = {}
     for axes, (title, group) in zip(paths.grid(len(groups), 3), groups.items(), strict=True):
         for ax, (view, across, up) in zip(axes, VIEWS, strict=True):
@@ -293,7 +273,7 @@ def draw_tips(time: np.ndarray, tips: Mapping[str, np.ndarray], table: BodyTable
             ax.margins(0.05)
             if view == "from above":
                 ax.invert_xaxis()
-            ax.plot(0.0, 0.0, "+", color=SOFT, markersize=10, label="where the reach begins")
+            ax.plot(0.0, 0.0, "+", color=fig.SOFT, markersize=10, label="where the reach begins")
             for name, reach in group.items():
                 at = 100.0 * reach[:: max(1, len(reach) // PATH_POINTS)][:, [across, up]]
                 ax.plot(at[:, 0], at[:, 1], **{**styles[name], "linewidth": 0.7})
@@ -302,4 +282,4 @@ def draw_tips(time: np.ndarray, tips: Mapping[str, np.ndarray], table: BodyTable
             heading = label if len(groups) == 1 else f"{title.partition(',')[0]}: {label}"
             panels[heading] = {name: 100.0 * reach[:, k] for name, reach in group.items()}
     paths.add_legend()
-    return {"paths": paths, "reach": draw_over_time(time, panels, f"{caption}: over time.", styles)}
+    return {"paths": paths, "reach": fig.draw_over_time(time, panels, f"{caption}: over time.", styles)}

@@ -4,12 +4,12 @@ Frames: B is the robot's root, the frame of its URDF; T is the person's torso, x
 coordinates in T to B. `u` holds the values of the joints of the arms, `q` is Pinocchio's configuration.
 """
 
-from .checks import LimitCheck as LimitCheck
-from .checks import SelfCollisions as SelfCollisions
-from .checks import check_limits as check_limits
-from .checks import find_self_collisions as find_self_collisions
 from .controller import ControllerParams as ControllerParams
+from .files import LimitCheck as LimitCheck
+from .files import SelfCollisions as SelfCollisions
 from .files import build_table as build_table
+from .files import check_limits as check_limits
+from .files import find_self_collisions as find_self_collisions
 from .files import summarize as summarize
 from .files import write_trajectory as write_trajectory
 from .maps import ROBOTS as ROBOTS

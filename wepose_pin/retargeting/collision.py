@@ -72,7 +72,7 @@ class CollisionModel:
             self._supports[joint] = self._supports[robot.model.parents[joint]]
             self._supports[joint, robot.model.idx_vs[joint]] = 1.0
         # Hulls closer than the clearance in the rest posture keep half of their distance there, or their overlap.
-        rest = self._measure(robot.rest, np.arange(len(self.pairs)))
+        rest = self.compute_distances(robot.rest, np.arange(len(self.pairs)))
         self.clearance = np.minimum(CLEARANCE, np.where(rest > 0.0, 0.5 * rest, rest))
         overlapping = self.clearance <= 0.0
         self.least_distance = np.where(overlapping, self.clearance - OVERLAP, LEAST_SHARE * self.clearance)
@@ -112,11 +112,6 @@ class CollisionModel:
         jacobian = _compute_distance_jacobian(distance, a, b, J, self._supports[first], self._supports[second])
         return NearPairs(indices, distance, jacobian, self.clearance[indices])
 
-    def compute_distances(self, data: Any, pairs: np.ndarray) -> np.ndarray:
-        """Distances [m] of some `pairs` (indices); `data` of the model holds joint placements."""
-        pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
-        return np.array([pin.computeDistance(self.hulls, self.data, k).min_distance for k in pairs.tolist()])
-
     def is_path_clear(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> bool:
         """Return whether all pairs keep their least distance on a way to rest.
 
@@ -137,7 +132,7 @@ class CollisionModel:
             begin, end = parts.pop()
             for at in (begin, end):
                 if at not in room:
-                    room[at] = self._measure(path[at - 1], critical) - self.least_distance[critical]
+                    room[at] = self.compute_distances(path[at - 1], critical) - self.least_distance[critical]
                     if (room[at] < 0.0).any():
                         return False
             covered = approach[end] - approach[begin] < room[begin] + room[end]
@@ -146,10 +141,11 @@ class CollisionModel:
                 parts += [(middle, end), (begin, middle)]
         return True
 
-    def _measure(self, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-        """Distances [m] of some pairs at joint positions (n,)."""
+    def compute_distances(self, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Distances [m] of some `pairs` (indices) at joint positions (n,)."""
         pin.forwardKinematics(self.robot.model, self._path_data, self.robot.configuration(position))
-        return self.compute_distances(self._path_data, pairs)
+        pin.updateGeometryPlacements(self.robot.model, self._path_data, self.hulls, self.data)
+        return np.array([pin.computeDistance(self.hulls, self.data, k).min_distance for k in pairs.tolist()])
 
     def _compute_levers(self, radius: np.ndarray) -> np.ndarray:
         """(pairs, n) [m per rad or m] by which a pair's distance changes at most where a joint moves.

@@ -19,24 +19,11 @@ import pinocchio as pin
 
 from ..body import BodyTable, load_table
 from ..errors import WrongOption
+from . import targets
 from .collision import CollisionModel
 from .controller import JointState, QpController
 from .robot import Robot
-from .targets import (
-    JUMP_SPEED,
-    STD_POOR,
-    WEIGHT_POOR,
-    ArmMotion,
-    HandTarget,
-    check_person_arms,
-    clamp_to_reach,
-    compute_swivel,
-    compute_target_reach,
-    compute_weight,
-    find_hand_segment,
-    find_person_arm,
-    map_arm,
-)
+from .targets import ArmMotion, HandTarget
 
 SMOOTHING_HZ = 6.0  # natural frequency of the low-pass, which halves the amplitude there as the zero-phase one does
 EXTRAPOLATE_S = 0.03  # [s] for which a pose is extrapolated until the next comes
@@ -128,7 +115,7 @@ class _HandReference:
         away, turn = target.position - self.position, pin.log3(target.rotation @ self.rotation.T)
         self.reached = self.reached or (_norm(away) < REACHED_M and _norm(turn) < REACHED_RAD)
         if self.reached:
-            trust = (target.weight - WEIGHT_POOR) / (1.0 - WEIGHT_POOR)
+            trust = (target.weight - targets.WEIGHT_POOR) / (1.0 - targets.WEIGHT_POOR)
             target_speed = APPROACH_SPEED * (FREE_SPEED / APPROACH_SPEED) ** trust
             up, down = np.exp(dt / SPEED_UP_S), np.exp(-dt / SPEED_DOWN_S)
             self.speed = float(min(max(target_speed, down * self.speed), up * self.speed))
@@ -181,16 +168,16 @@ class ArmObserver:
         table: BodyTable | None = None,
     ) -> None:
         table = table or load_table()
-        check_person_arms(robot, segments, points, table)
+        targets.check_person_arms(robot, segments, points, table)
         self._robot = robot
         lengths = list(table.lengths)
         cov = np.zeros((len(lengths), len(lengths))) if lengths_cov is None else lengths_cov
         self._segments = tuple(segments)
         self._points, self._rows, self._lengths_cov = [], [], []  # of each arm, into points, segments; [m²]
         for arm in robot.arms:
-            limb = find_person_arm(table, arm.side)
+            limb = targets.find_person_arm(table, arm.side)
             self._points.append([points.index(name) for name in limb.points])
-            chain = (str(limb.base), *limb.segments[:-1], find_hand_segment(limb, segments))
+            chain = (str(limb.base), *limb.segments[:-1], targets.find_hand_segment(limb, segments))
             self._rows.append([self._segments.index(name) for name in chain])
             names = (table.find_length(*ends) for ends in pairwise(limb.points))
             own = [lengths.index(name) for name in names if name is not None]
@@ -207,11 +194,11 @@ class ArmObserver:
                 return None
         if not self.scales:
             lengths = (float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for _, p in arms)
-            reaches = (compute_target_reach(self._robot, arm) for arm in self._robot.arms)
+            reaches = (targets.compute_target_reach(self._robot, arm) for arm in self._robot.arms)
             self.scales = [reach / length for reach, length in zip(reaches, lengths, strict=True)]
         observations = []
         for i, (quat, p) in enumerate(arms):
-            motion = map_arm(self._robot, self.scales[i], quat[0], quat[3], p)
+            motion = targets.map_arm(self._robot, self.scales[i], quat[0], quat[3], p)
             lost_segments = tuple(self._segments[row] for row in dict.fromkeys(self._rows[i]) if lost[row])
             observations.append(ArmObservation(motion, self._compute_std(i, p, std), lost_segments, self.scales[i]))
         return observations
@@ -326,18 +313,18 @@ class CommandStream:
                 _HandReference(pose.hand, pose.rotation, limit) for pose, limit in zip(poses, limits, strict=True)
             ]
         for i, observation in enumerate(self._observed):
-            std = STD_POOR if observation.lost else 0.0 if math.isnan(observation.std) else observation.std
-            trust = float(compute_weight(std))
+            std = targets.STD_POOR if observation.lost else 0.0 if math.isnan(observation.std) else observation.std
+            trust = float(targets.compute_weight(std))
             time_constant = TRUST_UP_S if trust > self._trust[i] else TRUST_DOWN_S
             self._trust[i] += (trust - self._trust[i]) * -math.expm1(-dt / time_constant)
         ahead = min(max(now - self._time, -dt), EXTRAPOLATE_S)
         moving = now - self._time <= EXTRAPOLATE_S
-        targets = [self._extrapolate(i, ahead, moving) for i in range(len(self._observed))]
-        limited = tuple(reference.step(target, dt) for reference, target in zip(self._references, targets, strict=True))
+        hands = [self._extrapolate(i, ahead, moving) for i in range(len(self._observed))]
+        limited = tuple(reference.step(target, dt) for reference, target in zip(self._references, hands, strict=True))
         self.state = self._controller.step(self.state, limited)
         self.stopping += self._controller.report.stopping
-        error = np.empty((len(targets), 2))
-        for i, target in enumerate(targets):
+        error = np.empty((len(hands), 2))
+        for i, target in enumerate(hands):
             pose = self._controller.get_arm_pose(i)
             turn = pin.log3(target.rotation @ pose.rotation.T)
             error[i] = _norm(pose.hand - target.position), _norm(turn)
@@ -359,13 +346,13 @@ class CommandStream:
         """Target of arm `i`, `ahead` [s] of its newest pose; without velocity where the next pose is overdue."""
         low_pass, arm, factor = self._low_passes[i], self.robot.arms[i], float(moving)
         offset, upper = low_pass.vectors + ahead * low_pass.rates
-        here, next_ = clamp_to_reach(np.stack([offset, offset + self.dt * low_pass.rates[0]]), arm.reach)
+        here, next_ = targets.clamp_to_reach(np.stack([offset, offset + self.dt * low_pass.rates[0]]), arm.reach)
         return HandTarget(
             arm.shoulder + here,
             factor * (next_ - here) / self.dt,
             pin.exp3(ahead * low_pass.angular_velocity) @ low_pass.rotation,
             factor * low_pass.angular_velocity,
-            compute_swivel(upper, offset),
+            targets.compute_swivel(upper, offset),
             float(self._trust[i]),
         )
 
@@ -385,7 +372,7 @@ class CommandStream:
 def _jumps(before: list[ArmObservation], now: list[ArmObservation], dt: float) -> bool:
     """Whether a hand moved or rotated faster than any can."""
     return any(
-        _norm(b.motion.offset - a.motion.offset) > JUMP_SPEED * b.scale * dt
+        _norm(b.motion.offset - a.motion.offset) > targets.JUMP_SPEED * b.scale * dt
         or _norm(pin.log3(b.motion.rotation @ a.motion.rotation.T)) > JUMP_RATE * dt
         for a, b in zip(before, now, strict=True)
     )

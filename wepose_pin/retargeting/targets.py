@@ -88,12 +88,6 @@ class ArmTargets:
             hands.append(path.differentiate(clock))
         return replace(self, time=moments, hands=tuple(hands), slowdown=np.interp(moments, time, self.slowdown))
 
-    def select(self, samples: np.ndarray, dt: float) -> ArmTargets:
-        """Return some samples (m,) int as a motion of their own, `dt` [s] apart."""
-        clock = np.arange(len(samples)) * dt
-        hands = (hand.sample(samples).differentiate(clock) for hand in self.hands)
-        return replace(self, time=self.time[samples], hands=tuple(hands), slowdown=self.slowdown[samples])
-
 
 class ArmMotion(NamedTuple):
     """One arm of the person in B, scaled; at one moment or over time (n, …)."""

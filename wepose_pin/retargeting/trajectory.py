@@ -314,16 +314,18 @@ def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[Arm
     x = np.minimum(np.arange(steps + round(SETTLE_S / dt)) / steps, 1.0)
     blend = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
     count, hands = len(blend), []
-    motion = motion.select(np.maximum(np.arange(count + len(motion.time)) - count, 0), dt)
-    for (pose, rotations), path, arm in zip(ends, motion.hands, robot.arms, strict=True):
+    samples = np.maximum(np.arange(count + len(motion.time)) - count, 0)
+    for (pose, rotations), hand, arm in zip(ends, motion.hands, robot.arms, strict=True):
+        path = hand.sample(samples)
         swivel = compute_swivel(pose.elbow - arm.shoulder, pose.hand - arm.shoulder) if arm.elbow >= 0 else np.zeros(3)
         for values, start in ((path.position, pose.hand), (path.unclamped, pose.hand), (path.swivel, swivel)):
             values[:count] = start + blend[:, None] * (values[count] - start)
         path.rotation[:count] = Slerp([0.0, 1.0], rotations)(blend).as_matrix()
         path.weight[:count], path.lost[:count] = 1.0, False
-        hands.append(path.differentiate(np.arange(len(path.weight)) * dt))
-    motion.slowdown[:count] = 1.0
-    return replace(motion, hands=tuple(hands)), count
+        hands.append(path.differentiate(np.arange(len(samples)) * dt))
+    slowdown = motion.slowdown[samples]
+    slowdown[:count] = 1.0
+    return replace(motion, time=motion.time[samples], hands=tuple(hands), slowdown=slowdown), count
 
 
 def _compute_slowdown(
