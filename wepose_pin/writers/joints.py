@@ -193,32 +193,32 @@ def write_lerobot(
     rate_hz, diagnostics = _check_alike(motions), list[Diagnostic]()
     listed = [each for motion in motions for each in _list_episodes(motion, episodes, instruction, diagnostics)]
     tasks = list(dict.fromkeys(task for _, _, task in listed))
-    tables, begins = [], np.cumsum([0, *(len(part.time) for part, _, _ in listed)])
-    for k, (part, after, task) in enumerate(listed):
-        frames = np.arange(len(part.time))
-        columns = {
-            STATE: _to_lists(part.position),
-            ACTION: _to_lists(np.vstack([part.position[1:], after])),
-            "timestamp": (frames / rate_hz).astype(np.float32),
-            "frame_index": frames,
-            "episode_index": np.full(len(frames), k),
-            "index": begins[k] + frames,
-            "task_index": np.full(len(frames), tasks.index(task)),
-        }
-        tables.append(pl.DataFrame(columns))
+    lengths = [len(part.time) for part, _, _ in listed]
+    begins, episode = np.cumsum([0, *lengths]), np.repeat(np.arange(len(listed)), lengths)
+    index = np.arange(begins[-1])
+    columns = {
+        STATE: _to_lists([part.position for part, _, _ in listed]),
+        ACTION: _to_lists([rows for part, after, _ in listed for rows in (part.position[1:], after[None])]),
+        "timestamp": ((index - begins[episode]) / rate_hz).astype(np.float32),
+        "frame_index": index - begins[episode],
+        "episode_index": episode,
+        "index": index,
+        "task_index": np.array([tasks.index(task) for _, _, task in listed])[episode],
+    }
+    frames = pl.DataFrame(columns)
     for name in ("data", "meta/episodes"):
         (folder / name / FILE).parent.mkdir(parents=True)
-    write_table(folder / "data" / FILE, pl.concat(tables))
+    write_table(folder / "data" / FILE, frames)
     about: dict[str, Any] = {
         "episode_index": np.arange(len(listed)),
         "tasks": [[task] for _, _, task in listed],
-        "length": np.diff(begins),
+        "length": lengths,
         "dataset_from_index": begins[:-1],
         "dataset_to_index": begins[1:],
     }
     for name in ("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index"):
         about[name] = np.zeros(len(listed), dtype=np.int64)
-    stats = [_compute_stats(table) for table in tables]
+    stats = [_compute_stats(frames.slice(*span)) for span in zip(begins, lengths, strict=False)]
     for feature, of_feature in stats[0].items():
         about |= {f"stats/{feature}/{name}": [each[feature][name] for each in stats] for name in of_feature}
     write_table(folder / "meta" / "episodes" / FILE, pl.DataFrame(about))
@@ -229,7 +229,7 @@ def write_lerobot(
     names = list(motions[0].joints)
     joints = {"dtype": "float32", "shape": [len(names)], "names": names}
     info["features"] |= {STATE: joints, ACTION: joints}
-    for name, content in (("stats", _compute_stats(pl.concat(tables))), ("info", info)):
+    for name, content in (("stats", _compute_stats(frames)), ("info", info)):
         (folder / "meta" / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
     return diagnostics
 
@@ -274,8 +274,8 @@ def _check_alike(motions: Sequence[JointMotion]) -> int:
     return rate_hz
 
 
-def _to_lists(values: np.ndarray) -> pl.Series:
-    return pl.Series(values.astype(np.float32), dtype=pl.Array(pl.Float32, values.shape[1]))
+def _to_lists(parts: Sequence[np.ndarray]) -> pl.Series:
+    return pl.Series(np.vstack(parts).astype(np.float32), dtype=pl.Array(pl.Float32, parts[0].shape[1]))
 
 
 def _compute_stats(table: pl.DataFrame) -> dict[str, dict[str, list[Any]]]:

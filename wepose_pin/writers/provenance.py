@@ -46,22 +46,23 @@ def code() -> dict[str, str | None]:
 
 def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Collect the provenance of what a command, or `CALL`, makes; of its options those that name files are inputs."""
-    inputs: dict[str, Path] = {}
-    options = {name: value for name, value in values.items() if name not in ("out", "force")}
-    for name, value in list(options.items()):
+    inputs, options = dict[str, Any](), dict[str, Any]()
+    for name, value in ((name, value) for name, value in values.items() if name not in ("out", "force")):
         several = value if isinstance(value, tuple) else (value,)
         # A text may name a file, as that of --protocol.
         named = (isinstance(each, Path) or str(each).endswith((".toml", ".urdf")) for each in several)
-        if several and all(named) and all(Path(each).exists() for each in several):
-            names = [name] if value is several[0] else [f"{name}.{i}" for i in range(len(several))]
-            inputs |= {each: Path(path) for each, path in zip(names, several, strict=True)}
-            del options[name]
+        if not several or not all(named) or not all(Path(each).exists() for each in several):
+            options[name] = value
+            continue
+        for k, path in enumerate(map(Path, several)):
+            key = f"{name}.{k}" if isinstance(value, tuple) else name
+            inputs[key] = {"path": str(path.absolute()), "files": file_hashes(path)}
     return {
         "format": FORMAT,
         "command": command,
         **code(),
         "options": json.loads(json.dumps(options, default=str)),
-        "inputs": {name: {"path": str(path.absolute()), "files": file_hashes(path)} for name, path in inputs.items()},
+        "inputs": inputs,
         "packages": versions(),
         "machine": f"{platform.system()} {platform.machine()}",
     }
@@ -105,22 +106,19 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     """List the files and folders that a session, or a model's table, names, as they stand there."""
     if path.suffix != ".toml" or not path.is_file():  # a pipe would block
         return []
-    names, content = set(), dict[str, Any]()
+    names, tables = set[str](), list[Mapping[str, Any]]()
     with contextlib.suppress(OSError, ValueError, RecursionError):  # its reader reports what is wrong
-        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-
-    def visit(table: Mapping[str, Any]) -> None:
+        tables.append(tomllib.loads(path.read_bytes().decode("utf-8-sig")))
+    for table in tables:
         for key, value in table.items():
             if isinstance(value, dict):
-                visit(value)
+                tables.append(value)
             elif isinstance(value, str) and (
                 key in ("urdf", "file", *(("truth",) if truth else ()))
                 or (key == "format" and value.endswith(".toml"))
                 or (key == "model" and (path.parent / value).is_file())  # a body of the package is part of the code
             ):
                 names.add(value)
-
-    visit(content)
     return sorted(names - {""})
 
 
