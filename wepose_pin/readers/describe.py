@@ -157,7 +157,6 @@ def _read_proposed(about: Description, folder: Path) -> None:
 
 
 def _advise(about: Description, body: BodyTable) -> str:
-    """Advise on what to do with the proposed session."""
     if about.recording is None:
         return "mend what cannot be read"
     sensors, then = about.recording.sensors, "wepose track SESSION -o result"
@@ -284,7 +283,6 @@ def _read(path: Path, format: str) -> tuple[Device, bool]:
 
 
 def _list_files_like(path: Path) -> list[Path]:
-    """List the files beside one, of its suffix, or the folders beside one."""
     siblings = [path.parent / file.name for file in sorted(path.absolute().parent.iterdir())]
     if path.is_dir():
         return [each for each in siblings if each.is_dir()][:MOST_SIBLINGS]
@@ -414,7 +412,6 @@ def _format_session(about: Description, folder: Path, body: BodyTable, model: Pa
 
 
 def _propose_mount(recording: Recording, segment: str, static: Sequence[tuple[float, float]]) -> str:
-    """Propose a comment with a mount to complete; gravity shows the axis that points up."""
     sensor = recording.sensors[segment]
     up, hint = "+x", "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
     if isinstance(sensor, ImuSensor):

@@ -148,7 +148,6 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
 
 
 def _sort_known(signal: Signal) -> Signal:
-    """Sort by time; rows without one are left out."""
     order = np.argsort(signal.time, kind="stable")[: np.isfinite(signal.time).sum()]  # NaN are last
     return Signal(signal.time[order], signal.values[order])
 

@@ -125,7 +125,6 @@ def _find_letters(name: str) -> Iterator[tuple[str, str]]:
 
 
 def _find_number(name: str) -> Iterator[tuple[str, str]]:
-    """Find the number at the end of a name that may be its axis."""
     if match := _NUMBERED.fullmatch(name):
         yield match[1] + HOLE, match[2]
 

@@ -68,7 +68,6 @@ def read_reference(path: Path, markers: Path | None = None) -> Reference:
 
 
 def _values(file: Any, group: str, name: str) -> list[Any]:
-    """Return the values of a parameter; none where it is not there."""
     return list(file["parameters"].get(group, {}).get(name, {}).get("value", []))
 
 
@@ -102,7 +101,6 @@ def _read_markers(path: Path, file: Any) -> tuple[np.ndarray, dict[str, np.ndarr
 
 
 def _read_rotations(path: Path, file: Any, table: MarkerTable) -> Reference:
-    """Read the segments' orientations among the rotations of a C3D."""
     transforms = file["data"]["rotations"].transpose(3, 2, 0, 1)
     labels = [label.removesuffix("_4X4") for label in _read_labels(file, "ROTATION")][: transforms.shape[1]]
     if _values(file, "ROTATION", "RATE"):
@@ -172,7 +170,6 @@ def read_marker_table(path: Path | None = None) -> MarkerTable:
 
 
 def _has_form(key: str, value: Any) -> bool:
-    """Return whether an entry of a table is what `_FORMS` says."""
     if key == "rotations" or not isinstance(value, list):
         return key == "rotations" and isinstance(value, str)
     if key == "points":

@@ -132,6 +132,12 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
 MESSAGE = "sensor_msgs/msg/Imu"
 
 
+def is_rosbag(path: Path) -> bool:
+    """Return whether a folder or a file is a bag."""
+    is_bag = _has_suffix(path, ".db3", ".mcap", ".bag") and not is_live_log(path)
+    return is_bag or (path / "metadata.yaml").is_file()
+
+
 def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """Read a bag of ROS 1 or 2, as `Format.read`; a sensor is a topic, or each frame of one that has several.
 
@@ -171,7 +177,6 @@ def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None
 
 
 def _read_imu(message: Any) -> list[float]:
-    """Read whether raw data and an orientation are provided, and the values."""
     rate, force, quat = message.angular_velocity, message.linear_acceleration, message.orientation
     has_raw = message.angular_velocity_covariance[0] != -1.0 and message.linear_acceleration_covariance[0] != -1.0
     has_quat = message.orientation_covariance[0] != -1.0 and any((quat.x, quat.y, quat.z, quat.w))
@@ -278,12 +283,13 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
     standardises them, which Metadata says. Source: tszheichoi/awesome-sensor-logger, and published recordings.
     """
     with open_folder(path) as files:
-        names = [name for name in (*PHONE_COLUMNS, "Metadata") if f"{name}.csv" in files]
-        tables = {name: read_table(files[f"{name}.csv"]) for name in names}
+        named = {name: files.get(f"{name}.csv") for name in (*PHONE_COLUMNS, "Metadata")}
+        tables = {name: read_table(file) for name, file in named.items() if file is not None}
     signals = {}
-    for name in (name for name in PHONE_COLUMNS if name in tables):
-        values = read_columns(tables[name], ["time", *PHONE_COLUMNS[name]], f"{name}.csv", str(path))
-        signals[name] = Signal(1e-9 * values[:, 0], values[:, 1:])
+    for name, columns in PHONE_COLUMNS.items():
+        if name in tables:
+            values = read_columns(tables[name], ["time", *columns], f"{name}.csv", str(path))
+            signals[name] = Signal(1e-9 * values[:, 0], values[:, 1:])
     if "TotalAcceleration" not in signals and {"Accelerometer", "Gravity"} <= set(signals):
         time, parts = join_signals(path.name, {name: signals[name] for name in ("Accelerometer", "Gravity")})
         signals["TotalAcceleration"] = Signal(time, parts["Accelerometer"] + parts["Gravity"])
@@ -310,15 +316,7 @@ MVNX = Format("Xsens MVNX", lambda path, start: _has_suffix(path, ".mvnx") or "<
 SENSOR_LOGGER = Format(
     "recording of Sensor Logger", lambda path, _: is_sensor_logger(path), read_sensor_logger, folder=True
 )
-ROSBAG = Format(
-    "ROS bag",
-    lambda path, _: (
-        (_has_suffix(path, ".db3", ".mcap", ".bag") and not is_live_log(path)) or (path / "metadata.yaml").is_file()
-    ),
-    read_rosbag,
-    whole=True,
-    folder=True,
-)
+ROSBAG = Format("ROS bag", lambda path, _: is_rosbag(path), read_rosbag, whole=True, folder=True)
 XDF = Format("XDF", lambda path, _: _has_suffix(path, ".xdf", ".xdfz"), read_xdf, whole=True)
 STO = "OpenSim table of IMU orientations"
 OPENSIM = Format(STO, lambda path, _: _has_suffix(path, ".sto"), read_opensim, whole=True)

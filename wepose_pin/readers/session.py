@@ -134,7 +134,6 @@ def _find_model(path: Path, top: TomlTable) -> str:
 
 
 def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
-    """Read the intervals [s] of each phase."""
     keys.allow(*keys.values, renamed=_RENAMED_PHASES)
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
@@ -172,7 +171,6 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
 
 
 def _check_columns(keys: Mapping[str, SensorKeys]) -> None:
-    """Raise `BadSession` where two sensors name one column."""
     owners: dict[tuple[str, str], str] = {}
     for name, each in keys.items():
         for signal, column in ((signal, column) for signal, own in each.signals.items() for column in own):

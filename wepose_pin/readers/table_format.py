@@ -332,7 +332,6 @@ def _find_sensors(format: TableFormat, tables: Sequence[DeviceTable]) -> _Sensor
 
 
 def _name_alone(format: TableFormat, path: Path) -> str:
-    """Name the only sensor of a file or folder."""
     path = path.absolute()
     if any(fnmatch.fnmatch(path.name, pattern) for pattern in format.files.values()) and not path.is_dir():
         path = path.parent
@@ -385,7 +384,6 @@ def _read_time(format: TableFormat, source: _Source, sensor: str, rate_hz: float
 
 
 def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor: str) -> int | None:
-    """Find the column of a signal's times."""
     table, first = source.table, source.columns[0]
     if format.times_before:
         if first == 0 or not _match(clock.column, table.names[first - 1]):

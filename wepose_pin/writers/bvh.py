@@ -122,7 +122,6 @@ def _compute_angles(motion: TrackResult, bone: Bone, above: np.ndarray | None) -
 
 
 def _format_hierarchy(bone: Bone, above: np.ndarray, depth: int) -> Iterator[str]:
-    """Format the lines of a bone and all below it."""
 
     def offset(v_W: np.ndarray) -> str:
         return "OFFSET " + " ".join(f"{100.0 * value + 0.0:.6f}" for value in _to_file_axes(v_W))

@@ -24,7 +24,7 @@ from .bvh import write_bvh
 from .c3d import write_c3d
 from .joints import write_lerobot, write_mcap, write_rosbag, write_rrd
 from .motion import ROBOT_URDF, TRAJECTORY, HasJointMotion, check_rate, convert_person, read_joint_motion, resample
-from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
+from .opensim import write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import data_folder
 from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
 
@@ -200,8 +200,8 @@ def export(
         partial = files.enter_context(whole)
         motions = [] if kind.of == BODY else [_read_motion(each, name, interval, phase, rate_hz) for each in results]
         if name == "sto" and own:
-            setups = [files.enter_context(whole_file(path, force)) for path in list_setups(file)]
-            write_setups(file, setups, motions[0], str(own.pop("osim_model")))
+            model = str(own.pop("osim_model"))
+            write_setups(file, motions[0], model, lambda path: files.enter_context(whole_file(path, force)))
         source = results[0] if kind.of == BODY else motions if kind.of == ROBOTS else motions[0]
         return Exported(name, kind.write(partial, source, **own) or [])
 
@@ -235,7 +235,6 @@ def _read_motion(
 
 
 def _choose_format(file: Path, name: str | None) -> str:
-    """Choose the format that is stated, or that of the file's suffix."""
     formats, suffix = list_formats(), file.suffix.lower()
     if name is None and suffix.removeprefix(".") not in formats:
         raise BadOption(f"-o {file}: '{suffix}' is no format's suffix; state it by --format; {one_of(formats)}")

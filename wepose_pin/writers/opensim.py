@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -118,18 +118,19 @@ def _write_quaternions(path: Path, motion: TrackResult, time: np.ndarray, quat_G
     _write_rows(path, header, pl.DataFrame({"time": time, **cells}))
 
 
-def list_setups(sto: Path) -> list[Path]:
-    """List what OpenSense needs beside a .sto: the placement, and the set-ups of IMU Placer and IK."""
-    return [sto.with_name(f"{sto.stem}{ending}") for ending in ("_placement.sto", "_placer.xml", "_ik.xml")]
+def write_setups(sto: Path, motion: TrackResult, model: str, open_file: Callable[[Path], Path]) -> None:
+    """Write what OpenSense needs beside a .sto: the placement, and the set-ups of IMU Placer and IK.
 
-
-def write_setups(sto: Path, written: Sequence[Path], motion: TrackResult, model: str) -> None:
-    """Write what OpenSense needs beside a .sto to `written`, in the order of `list_setups`; `model`: the subject's."""
-    write_placement(written[0], motion)
-    written[1].write_bytes(_fill("placer", model=model, stem=sto.stem))
+    `model`: the subject's. `open_file`: the path of a file → that to which it is written.
+    """
+    placement, placer, ik = (
+        open_file(sto.with_name(f"{sto.stem}{ending}")) for ending in ("_placement.sto", "_placer.xml", "_ik.xml")
+    )
+    write_placement(placement, motion)
+    placer.write_bytes(_fill("placer", model=model, stem=sto.stem))
     step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
     begin, end = (f"{time:.6f}" for time in (motion.pose.time[0] - step, motion.pose.time[-1] + step))
-    written[2].write_bytes(_fill("ik", stem=sto.stem, orientations=sto.name, begin=begin, end=end))
+    ik.write_bytes(_fill("ik", stem=sto.stem, orientations=sto.name, begin=begin, end=end))
 
 
 def _fill(setup: str, *, scales: str = "", **values: str) -> bytes:

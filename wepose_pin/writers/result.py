@@ -136,7 +136,6 @@ def _document(calibration: Calibration) -> dict[str, Any]:
 
 
 def _number(value: float) -> float | None:
-    """None where it is not finite, which JSON cannot say."""
     return float(value) if np.isfinite(value) else None
 
 
