@@ -142,7 +142,7 @@ def test_the_programme_is_that_of_pink(arm) -> None:
     stepper = control.QpController(free, CollisionModel(free), 0.01, params, limit_factor=1e6)
     state = control.JointState(arm.rest + 0.1, np.zeros(7), np.zeros(7))
     stepper.update_kinematics(state.position)
-    hand, turn, _ = stepper.get_arm_pose(0)
+    hand, turn, _ = stepper.poses[0]
     goal = pin.SE3(turn @ pin.exp3(np.array([0.02, -0.01, 0.03])), hand + [0.01, -0.02, 0.015])
     aim = control.HandTarget(goal.translation, np.zeros(3), goal.rotation, np.zeros(3), np.zeros(3), 1.0)
     ours = 0.01 * stepper.step(state, (aim,)).acceleration  # the programme's velocity: half a step on, from rest

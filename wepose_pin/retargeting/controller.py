@@ -115,6 +115,7 @@ class QpController:
     guarded: bool = True  # takes only steps from which the robot can stop without self-contact
     posture_reference: tuple[np.ndarray, np.ndarray] | None = None  # position and velocity (n,), in place of the rest
     report: StepReport = field(init=False)  # of the last step
+    poses: list[ArmPose] = field(init=False)  # of the arms, before it
 
     def __post_init__(self) -> None:
         try:
@@ -134,14 +135,9 @@ class QpController:
         self._limited, self._active_rows = np.zeros(n, dtype=bool), np.empty((0, n))  # of the last programme
 
     def update_kinematics(self, position: np.ndarray) -> None:
-        """Set the joint positions (n,), and compute Jacobians and the poses that `get_arm_pose` returns."""
+        """Set the joint positions (n,); compute Jacobians and `poses`."""
         pin.computeJointJacobians(self.robot.model, self.data, self.robot.configuration(position))
-        for arm in self._arms:
-            arm.update_pose()
-
-    def get_arm_pose(self, arm: int) -> ArmPose:
-        """Return an arm's pose at the positions of `update_kinematics`."""
-        return self._arms[arm].pose
+        self.poses = [arm.update_pose() for arm in self._arms]
 
     def step(self, state: JointState, targets: tuple[HandTarget, ...]) -> JointState:
         """Solve one step towards `targets` and return the next state; update `report`.
@@ -266,12 +262,13 @@ class _ArmTasks:
             joint = robot.model.parents[joint]
         return on_joint.rotation.copy(), on_joint.translation.copy(), of_joint.rotation, of_joint.translation, mask
 
-    def update_pose(self) -> None:
+    def update_pose(self) -> ArmPose:
         """Take the pose from Pinocchio's data."""
         R_JH, *_ = self._frames[0]
         points = [R_J @ p_JF + p_J for _, p_JF, R_J, p_J, _ in self._frames]
         elbow = points[1] if len(points) == 2 else np.full(3, np.nan)
         self.pose = ArmPose(points[0], self._frames[0][2] @ R_JH, elbow)
+        return self.pose
 
     def add_to_objective(
         self, H: np.ndarray, f: np.ndarray, target: HandTarget, params: np.ndarray, dt: float, v: np.ndarray

@@ -60,28 +60,18 @@ class Robot:
 
     def configuration(self, u: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration `q` of `model`: a continuous joint has cosine and sine there."""
-        if self.model.nq == self.model.nv:
-            return u
-        q = pin.neutral(self.model)
-        for value, (first, size) in zip(u, self._slots, strict=True):
-            q[first : first + size] = value if size == 1 else (np.cos(value), np.sin(value))
-        return q
+        return u if self.model.nq == self.model.nv else pin.integrate(self.model, self._neutral, u)
 
     @cached_property
-    def _slots(self) -> list[tuple[int, int]]:
-        """First index and size of each joint in `q`."""
-        return [(self.model.idx_qs[j], self.model.nqs[j]) for j in range(1, self.model.njoints)]
+    def _neutral(self) -> np.ndarray:
+        return pin.neutral(self.model)
 
     @property
     def posture(self) -> dict[str, float]:
         """Joint that does not move → its value in the rest posture [rad or m]."""
-        full, posture = self.full, {}
-        for name in full.names[1:]:
-            joint = full.getJointId(name)
-            if name not in self.names and full.nvs[joint] == 1:
-                q = self.rest_full[full.idx_qs[joint] :][: full.nqs[joint]]
-                posture[name] = float(q[0]) if len(q) == 1 else float(np.arctan2(q[1], q[0]))
-        return posture
+        full, value = self.full, pin.difference(self.full, pin.neutral(self.full), self.rest_full)
+        joints = {name: full.getJointId(name) for name in full.names[1:] if name not in self.names}
+        return {name: float(value[full.idx_vs[joint]]) for name, joint in joints.items() if full.nvs[joint] == 1}
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -187,7 +177,7 @@ def _check_limits(robot: RobotMap, name: str, limit: JointLimit) -> None:
 
 
 def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit]) -> np.ndarray:
-    q = pin.neutral(full)
+    values = np.zeros(full.nv)
     for joint, name in enumerate(full.names):
         limit, value = limits.get(name), robot.rest.get(name, 0.0)
         if limit is None or full.nvs[joint] != 1:
@@ -200,9 +190,8 @@ def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, Join
             )
         elif limit.lower <= limit.upper:
             value = float(np.clip(value, limit.lower, limit.upper))
-        first, size = full.idx_qs[joint], full.nqs[joint]
-        q[first : first + size] = value if size == 1 else (np.cos(value), np.sin(value))
-    return q
+        values[full.idx_vs[joint]] = value
+    return np.asarray(pin.integrate(full, pin.neutral(full), values))
 
 
 def _narrow_range(name: str, limit: JointLimit, limit_margin: float) -> tuple[float, float]:

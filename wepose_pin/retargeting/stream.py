@@ -307,10 +307,10 @@ class CommandStream:
         dt = self.dt
         if self._references is None:
             self._controller.update_kinematics(self.state.position)
-            poses = (self._controller.get_arm_pose(i) for i in range(len(self.robot.arms)))
             limits = (arm.reach * float(np.median(self.robot.a_max[arm.joints])) for arm in self.robot.arms)
             self._references = [
-                _HandReference(pose.hand, pose.rotation, limit) for pose, limit in zip(poses, limits, strict=True)
+                _HandReference(pose.hand, pose.rotation, limit)
+                for pose, limit in zip(self._controller.poses, limits, strict=True)
             ]
         for i, observation in enumerate(self._observed):
             std = targets.STD_POOR if observation.lost else 0.0 if math.isnan(observation.std) else observation.std
@@ -323,11 +323,8 @@ class CommandStream:
         limited = tuple(reference.step(target, dt) for reference, target in zip(self._references, hands, strict=True))
         self.state = self._controller.step(self.state, limited)
         self.stopping += self._controller.report.stopping
-        error = np.empty((len(hands), 2))
-        for i, target in enumerate(hands):
-            pose = self._controller.get_arm_pose(i)
-            turn = pin.log3(target.rotation @ pose.rotation.T)
-            error[i] = _norm(pose.hand - target.position), _norm(turn)
+        pairs = zip(self._controller.poses, hands, strict=True)
+        error = np.array([[_norm(a.hand - b.position), _norm(pin.log3(b.rotation @ a.rotation.T))] for a, b in pairs])
         if not all(reference.reached for reference in self._references):
             why = "" if self._approach_reason in ("", WAITING) else f": {self._approach_reason}"
             return self._command("approach", f"on the way to the person's hands{why}", error)

@@ -283,7 +283,7 @@ def _run_controller(
         else:
             state = controller.step(state, tuple(target.sample(k) for target in targets))
         reports.append(controller.report)
-        poses.append([controller.get_arm_pose(i) for i in range(len(hands))])
+        poses.append(controller.poses)
         if ends:
             break
         if k % PROGRESS_STEPS == 0:
@@ -303,8 +303,7 @@ def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[Arm
     robot, dt, longest = controller.robot, controller.dt, APPROACH_MIN_S
     controller.update_kinematics(robot.rest)
     ends = []
-    for i, path in enumerate(motion.hands):
-        pose = controller.get_arm_pose(i)
+    for pose, path in zip(controller.poses, motion.hands, strict=True):
         first, last = rotations = Rotation.from_matrix(np.stack([pose.rotation, path.rotation[0]]))
         ends.append((pose, rotations))
         distance, angle = np.linalg.norm(path.position[0] - pose.hand), (first.inv() * last).magnitude()
