@@ -26,65 +26,36 @@ class Imperfections:
     assumptions. An imperfection is off at zero, or a range at infinity. Each has its own stream of random numbers, and
     the number of draws does not depend on the size: a change of one does not change the draws of the others, of the
     motion, the mounts or the noise.
-
-    Parameters
-    ----------
-    tissue_gain : sensors turn on their segments as the joints turn
-    tissue_random : sensors turn on their segments at random while these move, by creep of the strap, and across the
-        segment under acceleration
-    sensor_place : sensors sit half-way along a segment at 0, at 0.6 of the upper arm and 0.85 of the forearm at 1
-    girdle : the shoulder's centre follows the arm by the regression of de Groot & Brand 2001; shoulders differ from
-        it, wander, and are at rest off their mean place
-    elbow : carrying angle, half in the humerus and half in the forearm, and an abduction that varies with flexion
-    wrists : bend in the clasp
-    start_pose : offsets of the start pose and of other poses
-    sway : a standing person and hanging arms sway; breath turns the sensor on the sternum
-    palm_slip : [m] palm to palm in the clasp, rms of the vector's length over the clasp, each axis of the torso has
-        1/√3 of it; starts and ends at zero. Half each palm
-    start_heading_deg : the torso's heading against W in the start pose, standard deviation. W's x is then where
-        the feet point, no longer where the torso faces
-    mount : "stated": within 10 deg of stated axes; "any": uniformly random, nothing stated
-    gyro_scale, accel_scale : scale factor's error, standard deviation of each axis, a share
-    misalignment_deg : of each sensing axis towards each other axis, standard deviation, gyroscope and accelerometer
-        each its own
-    g_sensitivity_deg_s : [deg/s per g] what specific force adds to the gyroscope, standard deviation of each entry of
-        the matrix
-    gyro_warm_up_deg_s : most change of the bias in the first 15 min, log-uniform from a tenth of it
-    gyro_range_deg_s, accel_range_g : full scale, cut off beyond
-    bits : of a sample over the full scale; 0: not quantised
-    clock_jitter : [s] standard deviation of each sampling time, at most a quarter of a step. The file states the even
-        time, as devices do that count samples, so that it stays in the data
-    clock_offset : [s] standard deviation of each sensor's clock against the stated time, unknown to the user as well
-    clock_drift_ppm : standard deviation of each clock's rate
-    dropped : share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms, one sample at least)
-    accel_average : share of the sample interval, up to the sample, over which the accelerometer averages the specific
-        force, as a device with a low-pass filter does; at 1 it is half a sample late. In no preset
     """
 
-    tissue_gain: float = 0.0
-    tissue_random: float = 0.0
-    sensor_place: float = 0.0
-    girdle: float = 0.0
-    elbow: float = 0.0
-    wrists: float = 0.0
-    start_pose: float = 0.0
-    sway: float = 0.0
-    palm_slip: float = 0.0  # [m]
-    start_heading_deg: float = 0.0
-    mount: Literal["stated", "any"] = "stated"
-    gyro_scale: float = 0.0
-    accel_scale: float = 0.0
-    misalignment_deg: float = 0.0
-    g_sensitivity_deg_s: float = 0.0  # per g
-    gyro_warm_up_deg_s: float = 0.0
-    gyro_range_deg_s: float = np.inf
-    accel_range_g: float = np.inf
-    bits: int = 0
-    clock_jitter: float = 0.0  # [s]
-    clock_offset: float = 0.0  # [s]
-    clock_drift_ppm: float = 0.0
-    dropped: float = 0.0
-    accel_average: float = 0.0
+    tissue_gain: float = 0.0  # sensors turn on their segments as the joints turn
+    tissue_random: float = 0.0  # … at random while these move, by creep of the strap, and by acceleration across them
+    sensor_place: float = 0.0  # sensors sit half-way along a segment; at 1 at 0.6 of an upper arm and 0.85 of a forearm
+    girdle: float = (
+        0.0  # shoulders follow the arm by de Groot & Brand 2001, differ from it, wander, rest off their mean
+    )
+    elbow: float = 0.0  # carrying angle, half in the humerus and half in the forearm, and abduction as the elbow flexes
+    wrists: float = 0.0  # bend in the clasp
+    start_pose: float = 0.0  # offsets of the start pose and of other poses
+    sway: float = 0.0  # of a standing person and hanging arms; breath turns the sensor on the sternum
+    palm_slip: float = 0.0  # [m] palm to palm, rms of the vector's length over the clasp, zero at its ends; half each
+    start_heading_deg: float = 0.0  # std of the torso's heading in the start pose; W's x is then where the feet point
+    mount: Literal["stated", "any"] = "stated"  # within 10 deg of stated axes; any: uniformly random, nothing stated
+    gyro_scale: float = 0.0  # std of each axis, a share
+    accel_scale: float = 0.0  # the same
+    misalignment_deg: float = 0.0  # std of each sensing axis towards each other axis, of either chip
+    g_sensitivity_deg_s: float = 0.0  # [deg/s per g] what force adds to the gyroscope, std of the matrix's entries
+    gyro_warm_up_deg_s: float = 0.0  # most change of the bias in the first 15 min, log-uniform from a tenth of it
+    gyro_range_deg_s: float = np.inf  # full scale, cut off beyond
+    accel_range_g: float = np.inf  # the same
+    bits: int = 0  # of a sample over the full scale; 0: not quantised
+    clock_jitter: float = 0.0  # [s] std of each sampling time, at most a quarter of a step; the file states even times
+    clock_offset: float = 0.0  # [s] std of each sensor's clock against the stated time
+    clock_drift_ppm: float = 0.0  # std of each clock's rate
+    dropped: float = 0.0  # share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms)
+    accel_average: float = (
+        0.0  # share of the interval over which the accelerometer averages; at 1 it is half of it late
+    )
 
     def __post_init__(self) -> None:
         check_fields(self, "")

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadOption
 from ..rotations import compose, log, turn_about
 from .people import E_Z, SIDES, BodyPose, Flaws, Offset, place_shoulder
-from .signals import Wander, integrate_pulse, make_pulse, make_step
+from .signals import Wander, integrate_step, make_pulse, make_step
 
 CIRCLING_POINT = "right_palm"  # draws the circles after the protocol
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -67,7 +67,12 @@ class BodyMotion(ABC):
 
     def __init__(self, flaws: Flaws) -> None:
         self.lengths, self.flaws = flaws.lengths, flaws
-        self.p_LS = place_sensors(flaws)  # segment → (3,) [m] in L
+        # Segment → where its sensor is, (3,) [m] in L: on the sternum, and on the outer side of the arm segments.
+        self.p_LS = {"torso": np.array((0.11, 0.0, 0.8 * self.lengths["trunk"]))}
+        upper_arm, forearm = 0.5 + flaws.sizes.sensor_place * np.array((0.1, 0.35))
+        for side, y in SIDES.items():
+            self.p_LS[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -upper_arm * self.lengths[f"{side}_upper_arm"]))
+            self.p_LS[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -forearm * self.lengths[f"{side}_forearm"]))
         self.pulses: list[tuple[float, float, float]] = []  # begin, end and ramp [s] of each time of motion
         self.phases: dict[str, list[tuple[float, float]]] = {"start": [(0.5, STAND_S - 0.5)]}
 
@@ -81,7 +86,10 @@ class BodyMotion(ABC):
 
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         """Return the time (n,) [s] that a segment has moved up to `t`: the integral of its activity."""
-        return sum((integrate_pulse(t, *pulse) for pulse in self.pulses), np.zeros_like(t))
+        moved = np.zeros_like(t)
+        for begin, end, ramp in self.pulses:  # whose ramps do not overlap
+            moved = moved + (integrate_step(t, begin, ramp) - integrate_step(t, end - ramp, ramp))
+        return moved
 
 
 class _Circle(NamedTuple):
@@ -111,16 +119,7 @@ class _Part(NamedTuple):
     kind: str  # the protocol, whose phase has its name
     start: float
     stop: float
-
-    @property
-    def leads(self) -> bool:
-        """True where palms are led to a point."""
-        return self.kind not in _PART_S
-
-    @property
-    def pulse(self) -> tuple[float, float, float]:
-        """Begin, end and ramp [s] of its motion."""
-        return self.start, self.stop, _POSE_RAMP_S if self.kind == "t_pose" else RAMP_S
+    pulse: tuple[float, float, float]  # begin, end and ramp of its motion
 
 
 class _Hand(NamedTuple):
@@ -148,6 +147,7 @@ class Motion(BodyMotion):
         self.reach = min(sum(arm) for arm in self.arm.values())
         self.clasp = (STAND_S + _LEAD_S, STAND_S + _LEAD_S + clasp_s)
         self.schedule = _schedule(parts, *self.clasp)
+        self.led = [part for part in self.schedule if part.kind not in _PART_S]  # in which palms are led to a point
         names = ("azimuth", "elevation", "radius", "roll", "pitch", "yaw")
         arm_names = (f"{side}_{angle}" for side in SIDES for angle in ("swivel", "pronation"))
         self.wander = {name: Wander(rng) for name in (*names, *arm_names)}
@@ -237,7 +237,7 @@ class Motion(BodyMotion):
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
         """Return the share (n,) of the hands' motion, 0 at both ends of a clasp."""
-        return sum((make_pulse(t, *part.pulse) for part in self.schedule if part.leads), np.zeros_like(t))
+        return sum((make_pulse(t, *part.pulse) for part in self.led), np.zeros_like(t))
 
     def _palms(self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         """Return the position (n, 3) [m] in T of each palm before the right one moves to the table."""
@@ -246,11 +246,11 @@ class Motion(BodyMotion):
     def _lead_shares(self, t: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return the share (n,) by which each palm leads its arm; 0: the arm hangs."""
         share, last = np.zeros_like(t), self.schedule[-1]
-        for part in (part for part in self.schedule if part.leads):
+        for part in self.led:
             first = part is self.schedule[0]  # from the N-pose
             rise = make_step(t, STAND_S, _LEAD_S) if first else make_step(t, part.start - _BLEND_S, _BLEND_S)
             share = share + rise * (1.0 - (0.0 if part is last else make_step(t, part.stop, _BLEND_S)))
-        if last.leads:
+        if last in self.led:
             return {"left": share * (1.0 - table), "right": share}  # the left arm returns to hanging
         return {"left": share, "right": share + table}
 
@@ -362,7 +362,7 @@ class Motion(BodyMotion):
             turns = (hanging * turn, hanging * flaws.sway_arm(t, side), offsets * start_pose.upper_arm[side])
             hang = compose(*(Rotation.from_rotvec(each) for each in turns))
             shoulder_T, R_TU, flexion = self._reach(t, side, hand, hang)
-            elbow = hanging * bend + offsets * (start_pose.flexion[side], start_pose.pronation[side])
+            elbow = hanging * bend + offsets * start_pose.elbow[side]
             elbow += lead[:, None] * np.column_stack((flexion, hand.pronation))
             R_WU = compose(R_WT, _scale(R_TU, lead), hang)
             R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, *elbow.T))
@@ -400,7 +400,8 @@ def _schedule(parts: Sequence[str], begin: float, end: float) -> list[_Part]:
     for kind, fixed, change in zip(parts, seconds, [*changes, last], strict=True):
         # Without a clasp the parts last longer.
         own = left if kind not in _PART_S else fixed + (0.0 if leads else left / len(parts))
-        schedule.append(_Part(kind, at, at + own))
+        ramp = _POSE_RAMP_S if kind == "t_pose" else RAMP_S
+        schedule.append(_Part(kind, at, at + own, (at, at + own, ramp)))
         at += own + change
     return schedule
 
@@ -430,14 +431,3 @@ def place_arm(pose: BodyPose, side: str, shoulder_W: np.ndarray, R_WL: Sequence[
         pose.origins[f"{side}_{part}"] = pose.points[f"{side}_{start}"] = p_W
         p_W = p_W + R.apply((0.0, 0.0, -flaws.lengths[f"{side}_{part}"]))
     pose.points[f"{side}_palm"] = p_W
-
-
-def place_sensors(flaws: Flaws) -> dict[str, np.ndarray]:
-    """Place each sensor in L [m]: on the sternum, and on the outer side of the arm segments."""
-    lengths = flaws.lengths
-    places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
-    upper_arm, forearm = 0.5 + flaws.sizes.sensor_place * np.array((0.1, 0.35))
-    for side, y in SIDES.items():
-        places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -upper_arm * lengths[f"{side}_upper_arm"]))
-        places[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -forearm * lengths[f"{side}_forearm"]))
-    return places

@@ -153,16 +153,14 @@ class StartPoseOffsets:
         self.torso = np.array((trunk[1], trunk[0], np.deg2rad(sizes.start_heading_deg) * heading))
         self.head = trunk[[3, 2, 4]]
         self.upper_arm: dict[str, np.ndarray] = {}
-        self.flexion: dict[str, float] = {}
-        self.pronation: dict[str, float] = {}  # about z of the forearm
+        self.elbow: dict[str, np.ndarray] = {}  # flexion, and pronation about z of the forearm
         mean, std = np.deg2rad(list(ARM_POSE.values())).T
         common, *both = rng.standard_normal((3, len(ARM_POSE)))
         for (side, y), own in zip(SIDES.items(), both, strict=True):
             z = np.sqrt(_SIDES_CORRELATION) * common + np.sqrt(1.0 - _SIDES_CORRELATION) * own
             outwards, forwards, twist, flexion, inwards = sizes.start_pose * (mean + std * np.clip(z, -2.3, 2.3))
             self.upper_arm[side] = np.array((y * outwards, -forwards, -y * twist))
-            self.flexion[side] = flexion
-            self.pronation[side] = -y * inwards
+            self.elbow[side] = np.array((flexion, -y * inwards))
 
 
 class Elbow:
@@ -320,16 +318,6 @@ def _round_off(angle: np.ndarray) -> np.ndarray:
 # Soft tissue ----------------------------------------------------------------------------------------------------------
 
 
-class _ArmRotations(NamedTuple):
-    """What the joints of an arm do at n times [rad]."""
-
-    elevation: np.ndarray  # (n,) of the upper arm in T
-    swing: np.ndarray  # (n, 3) rotation vector of the elevation, in the upper arm
-    twist: np.ndarray  # (n,) of the upper arm against the torso, about its long axis
-    flexion: np.ndarray  # (n,) of the elbow
-    pronation: np.ndarray  # (n,) of the forearm against the upper arm, about its long axis
-
-
 def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     """Split R into swing @ twist about z: the swing's rotation vector (n, 3) after the twist, the twist (n,) [rad]."""
     z, w = R.as_quat()[:, 2:].T
@@ -338,12 +326,13 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     return about_z.inv().apply(log(compose(R, about_z.inv()).as_quat())), twist
 
 
-def _read_arm(pose: BodyPose, side: str) -> _ArmRotations:
+def _read_arm(pose: BodyPose, side: str) -> tuple[np.ndarray, ...]:
+    """Return the upper arm's swing (n, 3) in its own frame, its elevation, flexion, twist and pronation (n,) [rad]."""
     R_WU = pose.R_WL[f"{side}_upper_arm"]
     swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
     bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
     elevation, flexion = (_round_off(np.linalg.norm(v, axis=1)) for v in (swing, bend))
-    return _ArmRotations(elevation, swing, twist, flexion, pronation)
+    return swing, elevation, flexion, twist, pronation
 
 
 class SoftTissue:
@@ -384,20 +373,19 @@ class SoftTissue:
             flexion, first = (_split(each.R_WL["torso"])[0][:, 1] for each in (pose, self.start))
             turn[:, 1] = self._gain(f"{self.part}_flexion", 0) * (flexion - first)
         if self.part == "torso":
-            left, right = (_read_arm(pose, side).elevation - _read_arm(self.start, side).elevation for side in SIDES)
+            left, right = (_read_arm(pose, side)[1] - _read_arm(self.start, side)[1] for side in SIDES)
             turn[:, 1] += self._gain("torso_elevation", 1) * 0.5 * (left + right)
             turn[:, 0] = self._gain("torso_sides", 2) * (right - left)
             turn[:, 2] = self._gain("torso_sides", 3) * (right - left)
         elif self.part in ("upper_arm", "forearm"):
-            arm, first_arm = _read_arm(pose, self.side), _read_arm(self.start, self.side)
-            bend = arm.flexion - first_arm.flexion
-            twist = arm.twist - first_arm.twist if self.part == "upper_arm" else arm.pronation - first_arm.pronation
-            turn[:, 2] = -(self.lost + self.draw[0] * _TWIST_STD) * twist
+            (swing, *angles), (_, *first_angles) = _read_arm(pose, self.side), _read_arm(self.start, self.side)
+            _, bend, twist, pronation = (angle - first for angle, first in zip(angles, first_angles, strict=True))
+            turn[:, 2] = -(self.lost + self.draw[0] * _TWIST_STD) * (twist if self.part == "upper_arm" else pronation)
             if self.part == "upper_arm":
                 # The angle above 30 deg, about the axis of elevation; none below 20 deg, where it has no meaning.
-                angle = np.linalg.norm(arm.swing, axis=1)
+                angle = np.linalg.norm(swing, axis=1)
                 above = integrate_step(angle, *_ELEVATED) / np.maximum(angle, _ELEVATED[0])
-                turn += self._gain("upper_arm_elevation", 1) * above[:, None] * arm.swing
+                turn += self._gain("upper_arm_elevation", 1) * above[:, None] * swing
                 turn += self._gain("upper_arm_flexion", 2, self.sign[0]) * bend[:, None] * self.across
                 turn[:, 2] += self._gain("upper_arm_flexion", 3, self.sign[1]) * bend
             else:

@@ -32,11 +32,6 @@ def integrate_step(t: np.ndarray, start: float, duration: float) -> np.ndarray:
     return duration * inner + np.maximum(t - start - duration, 0.0)
 
 
-def integrate_pulse(t: np.ndarray, start: float, stop: float, ramp: float) -> np.ndarray:
-    """Integrate `make_pulse` up to the times `t` (n,), for ramps that do not overlap; in seconds."""
-    return integrate_step(t, start, ramp) - integrate_step(t, stop - ramp, ramp)
-
-
 class Process:
     """A random process (k components) of rms 1 with nearly the spectrum of a first-order (Ornstein-Uhlenbeck) one.
 

@@ -162,9 +162,8 @@ def simulate(
     -------
     Simulation
         `recording()` is the `Recording` that a user would have, `truth()` the true `Pose`. Before the sensor's own
-        errors, gyro_S[k] is log(R_WS[k-1]ᵀ R_WS[k]) over the time between the two samples, so that the product of all
-        exp(gyro_S / rate) is the true orientation exactly; accel_S[k] is R_WS[k]ᵀ (p̈ + g e_z), p̈ by central
-        differences.
+        errors, the product of all exp(gyro_S / rate) is the true orientation exactly; accel_S[k] is
+        R_WS[k]ᵀ (p̈ + g e_z), p̈ by central differences.
 
     Raises
     ------
