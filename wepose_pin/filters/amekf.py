@@ -29,18 +29,7 @@ from ..arguments import NonNegative, Positive, PositiveOrInfinite
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
-from .base import (
-    HEADING,
-    RATE,
-    RATE_VAR,
-    START_HEADING_STD,
-    STATIC_TURN_NOISE,
-    FilterParams,
-    OrientationFilter,
-    bridge_rate,
-    into_sensor,
-    make_record,
-)
+from . import base
 from .noise import SensorNoise
 
 
@@ -90,7 +79,7 @@ BLOCK = np.dtype(
 
 
 @dataclass(frozen=True)
-class AmekfParams(FilterParams):
+class AmekfParams(base.FilterParams):
     """How wrong a MEMS sensor and how bounded a person's motion is; standard deviations for all recordings."""
 
     block_s: Positive = 0.25  # [s] between corrections; the covariance is propagated over it in one step
@@ -106,7 +95,7 @@ class AmekfParams(FilterParams):
     gyro_matrix_walk: NonNegative = 1e-6  # [1/√s]
     gyro_bias_walk: NonNegative = 5e-6  # [rad/s/√s], 10 deg/h in 100 s
     static_bias_std: NonNegative = 1e-4  # [rad/s] of the mean of gyro over a static block about the bias, without sway
-    static_turn_noise: NonNegative = STATIC_TURN_NOISE  # [rad/√s]
+    static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s]
     motion_bias_std: NonNegative = 1.7e-4  # [rad/s], 0.01 deg/s, bias in motion less that in a static phase
     motion_bias_walk: NonNegative = 5e-5  # [rad/s/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg
@@ -141,9 +130,8 @@ def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def
         v, p = VELOCITY + i, POSITION + i
         x, y, z = block.R[i, 0], block.R[i, 1], block.R[i, 2]
         for j in range(columns):
-            out[v, j] = (
-                P[v, j] + sign * (P[other, j] + out[other, j]) - (x * force[0, j] + y * force[1, j] + z * force[2, j])
-            )
+            moved = x * force[0, j] + y * force[1, j] + z * force[2, j]
+            out[v, j] = P[v, j] + sign * (P[other, j] + out[other, j]) - moved
         for j in range(columns):
             out[p, j] = P[p, j] + t * (P[v, j] + out[v, j])
 
@@ -261,14 +249,14 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     else:
         _correct_to_zero(state, POSITION, model.position_var)
     vertical = state.about_vertical
-    vertical[HEADING] += block.correction[2]
-    vertical[RATE_VAR] = 0.0
+    vertical[base.HEADING] += block.correction[2]
+    vertical[base.RATE_VAR] = 0.0
     for i in range(3):  # of the bias in motion
         b, m = GYRO_BIAS + i, MOTION_BIAS + i
-        vertical[RATE] += R[2, i] * (block.correction[b] + block.correction[m])
+        vertical[base.RATE] += R[2, i] * (block.correction[b] + block.correction[m])
         for j in range(3):
             c, n = GYRO_BIAS + j, MOTION_BIAS + j
-            vertical[RATE_VAR] += R[2, i] * R[2, j] * (P[b, c] + P[b, n] + P[m, c] + P[m, n])
+            vertical[base.RATE_VAR] += R[2, i] * R[2, j] * (P[b, c] + P[b, n] + P[m, c] + P[m, n])
     for i in range(VELOCITY, STATES):
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_VS, block.correction[0], block.correction[1], block.correction[2])
@@ -286,7 +274,7 @@ def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-unty
     moving, began = 0.0 if static else 1.0, 1.0 if state.samples else 0.0
     for i in range(3):
         bias[i] = x[GYRO_BIAS + i] + moving * x[MOTION_BIAS + i]
-    ux, uy, uz, is_measured, lost_var = bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
+    ux, uy, uz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
     if is_measured:
         state.gyro_sum[0] += gx
         state.gyro_sum[1] += gy
@@ -346,7 +334,7 @@ def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out
             blocks[row] = state.block
             row += 1
         attitude = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2], P[2, 0], P[2, 1], P[2, 2]
-        into_sensor(state.R_VS, attitude, state.lost_rotation_var, 0.0, out_cov[k])
+        base.into_sensor(state.R_VS, attitude, state.lost_rotation_var, 0.0, out_cov[k])
         for i in range(4):
             out_quat[k, i] = state.quat_VS[i]
         for i in range(3):
@@ -360,14 +348,14 @@ def make_records(
     p = params or AmekfParams()
     x, std, P = np.zeros(STATES), np.zeros(STATES), np.zeros((STATES, COLUMNS))
     x[ERROR.gyro_bias] = noise.gyro_bias
-    std[ERROR.attitude] = p.tilt_std, p.tilt_std, START_HEADING_STD
+    std[ERROR.attitude] = p.tilt_std, p.tilt_std, base.START_HEADING_STD
     std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
     std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
     std[ERROR.motion_bias] = p.motion_bias_std
     np.fill_diagonal(P, std**2)
     P[ERROR.gyro_bias, ERROR.gyro_bias] = noise.gyro_bias_cov
     bias_var = float(np.trace(noise.gyro_bias_cov)) / 3.0
-    state = make_record(
+    state = base.make_record(
         quat_VS=quat_VS,  # (4,) xyzw
         gyro_bias=noise.gyro_bias,  # [rad/s] as returned: with the motion bias where the sample is not static
         x=x,  # (25,) as `ErrorStates`; the attitude's error is always zero
@@ -398,15 +386,13 @@ def make_records(
     length = block_samples / rate_hz
     gyro_var, accel_var = float(np.trace(noise.gyro_cov)) / 3.0, float(np.trace(noise.accel_cov)) / 3.0
     noise_psd = np.zeros(STATES)
-    noise_psd[ERROR.attitude], noise_psd[ERROR.velocity] = (
-        gyro_var / rate_hz,
-        accel_var * noise.gravity**2 / rate_hz,
-    )
+    noise_psd[ERROR.attitude] = gyro_var / rate_hz
+    noise_psd[ERROR.velocity] = accel_var * noise.gravity**2 / rate_hz
     noise_psd[ERROR.gyro_bias], noise_psd[ERROR.gyro_matrix] = p.gyro_bias_walk**2, p.gyro_matrix_walk**2
     noise_psd[ERROR.accel_bias], noise_psd[ERROR.motion_bias] = p.accel_bias_walk**2, p.motion_bias_walk**2
     # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
     white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
-    model = make_record(
+    model = base.make_record(
         dt=1.0 / rate_hz,  # [s]
         block_samples=np.int64(block_samples),
         gravity=noise.gravity,  # [m/s²]
@@ -431,4 +417,4 @@ def make_records(
 # velocity's covariance grows. An impact (`AmekfParams.impact`) increases it too. A jump of the bias is adopted in the
 # next static phase; until then the tilt error reaches some degrees. Without a static phase everything is estimated in
 # motion: the tilt in ten seconds, the other parameters in about a minute.
-AMEKF = OrientationFilter(lambda *of_sensor: (*make_records(*of_sensor), np.empty(0, BLOCK)), run, AmekfParams)
+AMEKF = base.OrientationFilter(lambda *of_sensor: (*make_records(*of_sensor), np.empty(0, BLOCK)), run, AmekfParams)

@@ -38,11 +38,9 @@ def find_reference_phases(
     start pose; a mechanism stands still. `WeposeError`: a phase with too few samples, with motion, or without gravity.
     """
     stated, lying = recording.phases.get("start", ()), recording.phases.get("static", ())
+    where = recording.where()
     if lying and not stated:
-        raise BadPhase(
-            f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
-            f"start = [[from, to]]"
-        )
+        raise BadPhase(f"{where}: phases.static without phases.start; name its seconds, start = [[from, to]]")
     diagnostics = list(recording.diagnostics)
     for phase, intervals in (("start", stated), ("static", lying)):
         if len(intervals) > 1:
@@ -65,13 +63,11 @@ def find_reference_phases(
             diagnostics += _check_motion(recording, segment, start, place)
             diagnostics += _check_motion(recording, segment, static, "phases.static") if lying else []
         if isinstance(sensor, ImuSensor):
-            measured = sensor.part(recording.find_measured(segment, static))
+            part, worn = sensor.part(recording.find_measured(segment, static)), static == start and sways
             try:
-                noises[segment] = estimate_noise(
-                    measured.gyro_S, measured.accel_S, recording.rate_hz, static == start and sways
-                )
+                noises[segment] = estimate_noise(part.gyro_S, part.accel_S, recording.rate_hz, worn)
             except WeposeError as error:
-                raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
+                raise type(error)(f"{where}: sensors.{segment}: {error}") from error
     return start, static, noises, diagnostics
 
 

@@ -25,27 +25,16 @@ from ..arguments import NonNegative, PositiveOrInfinite
 from ..compilation import compiled, fma, inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector, rotate_unit_by_rate, up_in_sensor
-from .base import (
-    HEADING,
-    RATE,
-    RATE_VAR,
-    START_HEADING_STD,
-    STATIC_TURN_NOISE,
-    FilterParams,
-    OrientationFilter,
-    bridge_rate,
-    into_sensor,
-    make_record,
-)
+from . import base
 from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
 
 
 @dataclass(frozen=True)
-class SmekfParams(FilterParams):
+class SmekfParams(base.FilterParams):
     """What the static phase does not say of a sensor; standard deviations."""
 
     tilt_std: NonNegative = ACCEL_BIAS_STD  # [rad] of roll and pitch at the start
-    static_turn_noise: NonNegative = STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical
+    static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical
     gyro_scale_std: NonNegative = 0.002  # of the gyroscope's scale, which no static phase shows
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
 
@@ -130,9 +119,9 @@ def _correct(A, C, B, state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-
     x, y = g * (R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az), g * (R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az)
     A, C, B, a, b = _fuse(A, C, B, a, b, A[3:6], C[3:6], -x - a[1], A[4] + v)
     A, C, B, a, b = _fuse(A, C, B, a, b, A[0:3], C[0:3], y - a[0], A[0] + v)
-    state.about_vertical[HEADING] += a[2]
+    state.about_vertical[base.HEADING] += a[2]
     for i in range(3):
-        state.about_vertical[RATE] += R[2, i] * b[i]
+        state.about_vertical[base.RATE] += R[2, i] * b[i]
         bias[i] += b[i]
     rotate_by_world_vector(state.quat_VS, a[0], a[1], a[2])
     fill_matrix(state.quat_VS, R)
@@ -149,7 +138,7 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        wx, wy, wz, is_measured, lost_var = bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
+        wx, wy, wz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
         rotate_unit_by_rate(quat, wx, wy, wz, dt)
         fill_matrix(quat, R)
         A, C, B = _predict(A, C, B, R, model, lost_var)
@@ -158,10 +147,10 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         # A scale of the gyroscope that is wrong by s gives the heading an error of s times the rotation about the
         # vertical. The scale is no part of the filter's state, as in the paper.
         state.turned += dt * (R[2, 0] * wx + R[2, 1] * wy + R[2, 2] * wz)
-        into_sensor(R, A, 0.0, model.scale_var * state.turned * state.turned, out_cov[k])
+        base.into_sensor(R, A, 0.0, model.scale_var * state.turned * state.turned, out_cov[k])
         x, y, z = R[2, 0], R[2, 1], R[2, 2]
-        vertical[RATE_VAR] = fma(x, fma(B[0], x, 2.0 * fma(B[1], y, B[2] * z)), y * fma(B[4], y, 2.0 * B[5] * z))
-        vertical[RATE_VAR] += B[8] * z * z
+        vertical[base.RATE_VAR] = fma(x, fma(B[0], x, 2.0 * fma(B[1], y, B[2] * z)), y * fma(B[4], y, 2.0 * B[5] * z))
+        vertical[base.RATE_VAR] += B[8] * z * z
         for i in range(3):
             out_bias[k, i], out_vertical[k, i] = bias[i], vertical[i]
         for i in range(4):
@@ -175,9 +164,9 @@ def _make_records(
 ) -> tuple[np.ndarray, ...]:
     p = params or SmekfParams()
     P = np.zeros((3, 9))
-    P[0, [0, 4, 8]] = np.square([p.tilt_std, p.tilt_std, START_HEADING_STD])
+    P[0, [0, 4, 8]] = np.square([p.tilt_std, p.tilt_std, base.START_HEADING_STD])
     P[2] = noise.gyro_bias_cov.ravel()
-    state = make_record(
+    state = base.make_record(
         quat_VS=quat_VS,  # (4,) xyzw
         gyro_bias=noise.gyro_bias,  # (3,) [rad/s]
         P=P,  # A, C, B of a in V [rad] and b in S [rad/s]
@@ -187,10 +176,9 @@ def _make_records(
         about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
         R_VS=np.zeros((3, 3)),
     )
-    gyro_var, accel_var, step_var = (
-        float(np.trace(cov)) / 3.0 for cov in (noise.gyro_cov, noise.accel_cov, noise.bias_step_cov)
-    )
-    model = make_record(
+    covs = noise.gyro_cov, noise.accel_cov, noise.bias_step_cov
+    gyro_var, accel_var, step_var = (float(np.trace(cov)) / 3.0 for cov in covs)
+    model = base.make_record(
         dt=1.0 / rate_hz,  # [s]
         inverse_gravity=1.0 / noise.gravity,  # [s²/m]
         attitude_var=gyro_var / rate_hz**2,  # [rad²] of a sample
@@ -205,7 +193,7 @@ def _make_records(
 
 
 # While gyro is lost, its last rate is held and fades, and `attitude_cov` grows by the motion that may have been missed.
-SMEKF = OrientationFilter(_make_records, _run, SmekfParams)
+SMEKF = base.OrientationFilter(_make_records, _run, SmekfParams)
 
 
 # As published, to the first order -------------------------------------------------------------------------------------
@@ -236,9 +224,9 @@ def _run_published(states, models, gyro_S, accel_S, static, out_quat, out_bias, 
                 P[:] = (identity - K @ H) @ P
                 rotate_by_vector(quat, x[0], x[1], x[2])
                 bias += x[3:]
-                vertical[HEADING] += np.dot(up, x[:3])
-                vertical[RATE] += np.dot(up, x[3:])
-            vertical[RATE_VAR] = np.dot(up, np.ascontiguousarray(P[3:, 3:]) @ up)
+                vertical[base.HEADING] += np.dot(up, x[:3])
+                vertical[base.RATE] += np.dot(up, x[3:])
+            vertical[base.RATE_VAR] = np.dot(up, np.ascontiguousarray(P[3:, 3:]) @ up)
         out_quat[k], out_bias[k], out_cov[k], out_vertical[k] = quat, bias, P[:3, :3], vertical
 
 
@@ -260,9 +248,9 @@ def _make_published_records(
     Q[:3, :3], Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov  # of [w_ω; w_b]
     R[:3, :3], R[3:, 3:] = noise.accel_cov, noise.gyro_cov  # of [w_g; w_ω]
     P = START_VAR * np.eye(6)
-    state = make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias, P=P, about_vertical=np.zeros(3))
-    return state, make_record(dt=1.0 / rate_hz, gravity=noise.gravity, Q=Q, R=R)
+    state = base.make_record(quat_VS=quat_VS, gyro_bias=noise.gyro_bias, P=P, about_vertical=np.zeros(3))
+    return state, base.make_record(dt=1.0 / rate_hz, gravity=noise.gravity, Q=Q, R=R)
 
 
 # With the covariances of the authors' software, and in `sensors` with the paper's static test.
-PUBLISHED_SMEKF = OrientationFilter(_make_published_records, _run_published)
+PUBLISHED_SMEKF = base.OrientationFilter(_make_published_records, _run_published)
