@@ -272,10 +272,8 @@ class Recording:
         for segment, sensor in self.imus.items():
             force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
             if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
-                raise BadData(
-                    f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed, 9.8 "
-                    f"where nothing moves"
-                )
+                text = f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed"
+                raise BadData(f"{text}, 9.8 where nothing moves")
         return self
 
     @property
@@ -322,12 +320,12 @@ class Recording:
         """Return the intervals of a phase; `BadPhase`: the recording does not have it."""
         intervals = self.phases.get(name, ())
         if not intervals:
-            live = bool(self.source) and str(self.source).endswith(".mcap")
-            add = f"write a session by `wepose info {Path(self.where()).name} --write` and add" if live else "add"
+            add, free = "add", "; without joined hands: --protocol free" if name == "clasp" else ""
+            if (source := Path(self.where())).suffix == ".mcap":
+                add = f"write a session by `wepose info {source.name} --write` and add"
             raise BadPhase(
-                f"{self.where()}: phases.{name} is needed here and missing; {add} [phases] {name} = "
-                f"[[from, to]] in seconds; {one_of(self.phases, name)}"
-                f"{'; without joined hands: --protocol free' if name == 'clasp' else ''}"
+                f"{self.where()}: phases.{name} is needed here and missing; {add} [phases] {name} = [[from, to]] in "
+                f"seconds; {one_of(self.phases, name)}{free}"
             )
         return intervals
 

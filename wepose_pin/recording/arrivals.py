@@ -110,10 +110,8 @@ def order_arrivals(samples: Sequence[Samples], sensors: Sequence[str]) -> Arriva
     sensor = np.array([sensors.index(s.sensor) for s in samples], dtype=np.uint8)
     which = sensor.repeat([len(s.time) for s in samples])
     time, gyro_S, accel_S = (np.concatenate(column, dtype=float) for column in tuple(zip(*samples, strict=True))[1:])
-    if len(samples) > 1 and not (time[1:] >= time[:-1]).all():
-        order = np.argsort(time, kind="stable")
-        return Arrivals(which[order], time[order], gyro_S[order], accel_S[order])
-    return Arrivals(which, time, gyro_S, accel_S)
+    order = np.argsort(time, kind="stable") if len(samples) > 1 else slice(None)
+    return Arrivals(which[order], time[order], gyro_S[order], accel_S[order])
 
 
 class Ticks(NamedTuple):
@@ -338,17 +336,13 @@ def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-unty
     """Write the next tick into `out` (k, 6), and drop the samples that no later tick needs."""
     dt, t = clock.dt, clock.begin + clock.tick * clock.dt
     for s in range(len(sensors)):
-        sensor, buffer, n = sensors[s], buffers[s], sensors[s].buffered
+        sensor, buffer, n, level = sensors[s], buffers[s], sensors[s].buffered, sensors[s].saturation.level
         i = _find_sample(buffer, n, t, dt)
-        if i == n:
-            sensor.lost = True
-        level = sensor.saturation.level
+        sensor.lost = sensor.lost or i == n
         if not _write_value(buffer, n, i, t, dt, sensor.is_orientation, out[s]):
             sensor.counts[MISSING] += 1
             out[s, :] = np.nan
-        elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * min(
-            level[0], level[1], level[2]
-        ):
+        elif np.abs(out[s, :3]).max() >= (1.0 - AT_RANGE) * level.min():
             sensor.counts[CUT_OFF] += 1
             out[s, :] = np.nan
         out_lost[s] = sensor.lost
