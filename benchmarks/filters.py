@@ -16,7 +16,7 @@ import numpy as np
 
 import wepose_pin as wp
 from wepose_pin.filters import METHODS, OFFLINE, SensorFilters
-from wepose_pin.filters.noise import SensorNoise, estimate_noise
+from wepose_pin.filters.phases import SensorNoise, estimate_noise
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import simulate, simulate_person
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import rotations
 from wepose_pin.data_tables import read_columns, read_table
 from wepose_pin.filters import BEST, Orientation, SensorFilters
-from wepose_pin.filters.noise import SensorNoise
+from wepose_pin.filters.phases import SensorNoise
 from wepose_pin.readers.arrays import read_mat
 from wepose_pin.recording import ImuSensor, Recording
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.single import simulate_paper_dynamic
 from wepose_pin import ImuSensor, OrientationSensor, Recording, StaticTest, estimate_orientation, track
-from wepose_pin.filters.noise import estimate_noise
+from wepose_pin.filters.phases import estimate_noise
 
 RATE = 100.0
 # The paper's conditions alone, without (5) and (6)

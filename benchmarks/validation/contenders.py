@@ -16,7 +16,7 @@ import numpy as np
 
 from wepose_pin import rotations
 from wepose_pin.filters import METHODS, GdcParams, NcfParams
-from wepose_pin.filters.noise import SensorNoise
+from wepose_pin.filters.phases import SensorNoise
 from wepose_pin.filters.static import StaticTest
 
 from ..trials import run_filter

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from wepose_pin.errors import MissingFile
 from wepose_pin.evaluation import attitude_error
-from wepose_pin.filters.noise import SensorNoise, estimate_noise
+from wepose_pin.filters.phases import SensorNoise, estimate_noise
 from wepose_pin.simulation.imperfections import GRAVITY, MTI_3
 
 from ..trials import (

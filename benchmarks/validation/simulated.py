@@ -20,7 +20,7 @@ from wepose_pin.body import ROOT, BodyTable, load_table
 from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.calibration import Formulation, calibrate
 from wepose_pin.evaluation import AttitudeError, Evaluation, attitude_error, evaluate
-from wepose_pin.filters.noise import estimate_noise
+from wepose_pin.filters.phases import estimate_noise
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import (
     CIRCLING_POINT,

@@ -39,7 +39,8 @@ from ..body.table import check_segments
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, SensorFilters, check_method
-from ..filters.phases import collect_orientations, find_reference_phases
+from ..filters.phases import find_reference_phases
+from ..filters.sensors import collect_orientations
 from ..recording import Recording
 from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
 from .headings import add_couplings, search_headings

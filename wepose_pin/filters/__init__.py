@@ -21,7 +21,7 @@ from .base import Orientation as Orientation
 from .base import join_orientations as join_orientations
 from .complementary import GdcParams as GdcParams
 from .complementary import NcfParams as NcfParams
-from .noise import TYPICAL, estimate_noise
+from .phases import TYPICAL, estimate_noise
 from .sensors import BEST as BEST
 from .sensors import METHODS as METHODS
 from .sensors import OFFLINE as OFFLINE

@@ -30,7 +30,7 @@ from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
 from . import base
-from .noise import SensorNoise
+from .phases import SensorNoise
 
 
 class ErrorStates(NamedTuple):

@@ -15,7 +15,7 @@ from ..arguments import check_fields
 from ..compilation import inlined
 from ..diagnostics import Diagnostic, notebook_html
 from ..recording.limits import HIGHEST_RATE_SQUARED
-from .noise import SensorNoise
+from .phases import SensorNoise
 
 # [rad/√s] by which a static sensor may rotate about the vertical undetected: 0.01 deg/s for 10 s at a time
 STATIC_TURN_NOISE = 8e-4

@@ -21,7 +21,7 @@ from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import product, rotate_by_vector, up_in_sensor
 from .base import FilterParams, OrientationFilter, make_record
-from .noise import SensorNoise
+from .phases import SensorNoise
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,15 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..errors import BadData, BadOption, one_of
-from ..recording import ImuSensor, Recording
+from ..recording import ImuSensor, OrientationSensor, Recording
 from .amekf import AMEKF
 from .base import Orientation, OrientationFilter, as_rows, count_processors, make_orientation
 from .complementary import GDC, NCF
-from .noise import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
+from .phases import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_start_tilt
 from .smekf import PUBLISHED_SMEKF, SMEKF
 from .smoother import SMOOTHER
 from .static import USUAL_TEST, StaticTest, find_static, make_static_records
@@ -197,3 +198,18 @@ class SensorFilters:
 def _find_turn(rate: np.ndarray, rate_hz: float) -> np.ndarray:
     """Return the rotation [rad] over a sample; of lost ones zero."""
     return np.where(np.isfinite(rate), rate, 0.0) / rate_hz
+
+
+def collect_orientations(recording: Recording, filtered: Mapping[str, Orientation]) -> dict[str, Rotation]:
+    """Return segment → n orientations R_VS of its sensor, `filtered` or measured; without mounts."""
+    return {
+        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else filtered[segment]).quat_VS)
+        for segment, sensor in recording.sensors.items()
+    }
+
+
+def average_start(
+    recording: Recording, R_VS: Mapping[str, Rotation], start: tuple[float, float]
+) -> dict[str, Rotation]:
+    """Return segment → mean orientation of its sensor in the start pose [s]."""
+    return {name: each[recording.find_measured(name, start)].mean() for name, each in R_VS.items()}

@@ -26,7 +26,7 @@ from ..compilation import compiled, fma, inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector, rotate_unit_by_rate, up_in_sensor
 from . import base
-from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
+from .phases import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
 
 
 @dataclass(frozen=True)

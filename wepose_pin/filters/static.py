@@ -23,7 +23,7 @@ from ..arguments import NonNegative, Range, check_fields
 from ..compilation import inlined, kernel
 from ..errors import BadOption
 from .base import make_record
-from .noise import BLOCK_S, SensorNoise
+from .phases import BLOCK_S, SensorNoise
 
 NEWEST_S = 0.05  # [s] of condition (6), about as long as the fastest smooth motion takes to begin
 # Of condition (5): about two periods of a standing person's sway, which cancels in the average; one standard deviation

@@ -36,7 +36,7 @@ from ..body.subject import Subject
 from ..body.table import HingeJoint
 from ..calibration import load_protocol
 from ..errors import BadSession
-from ..filters.noise import SensorNoise
+from ..filters.phases import SensorNoise
 from ..observations import LEAST_RATE_HZ, PointPath, find_hinges, find_joint_pairs, linearize_hinge, linearize_joint
 from ..recording import Recording
 

@@ -15,7 +15,7 @@ from ..body.mounts import StartPose, compute_start_heading_var, find_mount_covar
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..filters import Orientation
-from ..filters.noise import ACCEL_BIAS_STD
+from ..filters.phases import ACCEL_BIAS_STD
 from ..recording import Recording
 
 

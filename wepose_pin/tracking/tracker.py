@@ -35,7 +35,8 @@ from ..diagnostics import drop_consequences
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import BEST, OFFLINE, Orientation, SensorFilters, check_method
 from ..filters.base import HOLD_S, LOST_RATE_STD
-from ..filters.phases import BEGINNING_S, average_start, collect_orientations, find_reference_phases
+from ..filters.phases import BEGINNING_S, find_reference_phases
+from ..filters.sensors import average_start, collect_orientations
 from ..filters.static import StaticTest
 from ..recording import ImuSensor, Recording, Sensor, join_recordings
 from ..recording.arrivals import unpack_orientations
