@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from functools import cache
@@ -25,31 +26,29 @@ from .errors import BadData, BadOption, one_of
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers above `low`, or at least `low` where `closed`, and at most `high`; finite unless `infinite`."""
+    """Numbers above `low`, or at least `low` where `closed`, and at most `high`: finite unless that is infinite."""
 
     low: float
     closed: bool
-    high: float = math.inf
-    infinite: bool = False
+    high: float = sys.float_info.max
     unit: str = ""
 
     def __str__(self) -> str:
         unit = f" [{self.unit}]" if self.unit else ""
         if self.low <= -1e300:
             return f"a finite number{unit}"
-        if self.closed and math.isfinite(self.high):
+        if self.closed and self.high < sys.float_info.max:
             return f"a number{unit} from {self.low:g} to {self.high:g}"
-        kind, up_to = "" if self.infinite else "finite ", "" if math.isinf(self.high) else f", up to {self.high:g}"
+        kind, up_to = "finite " * (self.high < math.inf), f", up to {self.high:g}" * (self.high < sys.float_info.max)
         return f"a {kind}number{unit} {'at least' if self.closed else 'above'} {self.low:g}{up_to}"
 
     def __contains__(self, value: float) -> bool:
-        above = self.low <= value if self.closed else self.low < value
-        return above and value <= self.high and (value < math.inf or self.infinite)
+        return (self.low <= value if self.closed else self.low < value) and value <= self.high
 
 
 Positive = Annotated[float, Range(0.0, closed=False)]
 NonNegative = Annotated[float, Range(0.0, closed=True)]
-PositiveOrInfinite = Annotated[float, Range(0.0, closed=False, infinite=True)]
+PositiveOrInfinite = Annotated[float, Range(0.0, closed=False, high=math.inf)]
 Count = Annotated[int, Range(0.0, closed=True)]
 
 
@@ -154,25 +153,18 @@ def _show(value: Any) -> str:
 
 
 def check_array(
-    place: str,
-    values: Any,
-    shape: tuple[int, ...],
-    rows: str = "",
-    *,
-    flags: bool = False,
-    missing: bool = False,
-    unit: float = np.inf,
+    place: str, values: Any, shape: tuple[int, ...], *, flags: bool = False, missing: bool = False, unit: float = np.inf
 ) -> None:
     """Raise `BadData` where `values` is no array of that shape of finite numbers, or NaN where they may be `missing`.
 
-    `rows` ends the text; `flags`: an array of bool is needed; `unit`: by how much the length of quaternions (…, 4) or
-    directions (…, 3) may differ from 1
+    `flags`: an array of bool is needed; `unit`: by how much the length of quaternions (…, 4) or directions (…, 3) may
+    differ from 1
     """
     if not isinstance(values, np.ndarray) or values.dtype.kind not in ("b" if flags else "fiu"):
         kind = "bool" if flags else "real numbers"
         raise BadData(f"{place} = {_show(values)}: a NumPy array of {kind}, {shape}, is needed")
     if values.shape != shape:
-        raise BadData(f"{place} has the shape {values.shape}; {shape} is needed{rows}")
+        raise BadData(f"{place} has the shape {values.shape}; {shape} is needed")
     wrong = np.isinf(values) if missing else ~np.isfinite(values)
     if wrong.any():
         k = tuple(int(i) for i in np.argwhere(wrong)[0])

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import shutil
 import tempfile
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -307,11 +306,11 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
     # Inside an existing `out`: it may be a separate file system, or the only writable place.
     existing = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
     try:
-        own = Path(tempfile.mkdtemp(prefix=prefix, dir=existing))
+        own = tempfile.TemporaryDirectory(prefix=prefix, dir=existing, ignore_cleanup_errors=True)
     except OSError as error:
         raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
-    try:
-        partial = own / "whole"  # with the user's usual permissions
+    with own as folder:
+        partial = Path(folder) / "whole"  # with the user's usual permissions
         partial.mkdir()
         yield partial
         _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
@@ -328,8 +327,6 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
             out.parent.mkdir(parents=True, exist_ok=True)
             partial.rename(out)
         written.append(out)
-    finally:
-        shutil.rmtree(own, ignore_errors=True)
 
 
 def _check_folder(out: Path, force: bool, prefix: str) -> None:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import check_array, check_fields, check_names
 from ..errors import BadData, BadModel, one_of
-from ..recording import EACH_TIME, check_time, format_span
+from ..recording import check_time, format_span
 from ..rotations import unwrap_signs
 from .body import BodyModel
 from .girdle import MEAN_RAISED, PARAMETERS, follow_law
@@ -90,7 +90,7 @@ class Pose:
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
                 place = f"{where}{name}.{key}"
-                check_array(place, values, shape, EACH_TIME, flags=name == "gap", missing=True, unit=unit)
+                check_array(place, values, shape, flags=name == "gap", missing=True, unit=unit)
         return self
 
 

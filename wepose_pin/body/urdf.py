@@ -110,28 +110,24 @@ class Visual(NamedTuple):
     """A visual of a link; sizes as in URDF."""
 
     link: str
-    kind: str  # "box" | "cylinder" | "sphere" | "mesh"
-    size: tuple[float, ...]  # box: x, y, z; cylinder: radius, length along z; sphere: radius [m]; mesh: scale x, y, z
+    kind: str  # "box" | "cylinder" | "sphere"
+    size: tuple[float, ...]  # box: x, y, z; cylinder: radius, length along z; sphere: radius [m]
     quat_LV: np.ndarray  # (4,) xyzw, visual to link
     p_LV: np.ndarray  # (3,) [m]
     rgba: tuple[float, float, float, float]
-    file: str | None = None  # of a mesh, as the URDF names it
 
 
 def list_visuals(robot: Any) -> list[Visual]:
-    """List the visuals of all links that have a geometry."""
+    """List the visuals of all links that are boxes, cylinders or spheres."""
     colours, visuals = {m.name: m.color.rgba for m in robot.materials if m.color is not None}, []
     for name, visual in ((link.name, visual) for link in robot.links for visual in link.visuals):
-        shape = visual.geometry
-        box, cylinder, sphere, mesh = shape.box, shape.cylinder, shape.sphere, shape.mesh
+        box, cylinder, sphere = visual.geometry.box, visual.geometry.cylinder, visual.geometry.sphere
         if box is not None:
             kind, size = "box", box.size
         elif cylinder is not None:
             kind, size = "cylinder", (cylinder.radius, cylinder.length)
         elif sphere is not None:
             kind, size = "sphere", (sphere.radius,)
-        elif mesh is not None:
-            kind, size = "mesh", np.ones(3) if mesh.scale is None else mesh.scale * np.ones(3)
         else:
             continue
         rgba = (0.7, 0.7, 0.7, 1.0)
@@ -139,8 +135,7 @@ def list_visuals(robot: Any) -> list[Visual]:
             rgba = material.color.rgba if material.color is not None else colours.get(material.name, rgba)
         r, g, b, a = (float(v) for v in rgba)
         quat, p_LV = Rotation.from_matrix(visual.origin[:3, :3]).as_quat(), visual.origin[:3, 3].copy()
-        file = mesh.filename if kind == "mesh" else None
-        visuals.append(Visual(name, kind, tuple(float(v) for v in size), quat, p_LV, (r, g, b, a), file))
+        visuals.append(Visual(name, kind, tuple(float(v) for v in size), quat, p_LV, (r, g, b, a)))
     return visuals
 
 

@@ -168,7 +168,7 @@ class PoseEncoder:
 
     def __init__(self, model: BodyModel, driven: RobotOutput | None = None) -> None:
         self.identity = secrets.token_hex(8)  # of the page that draws its frames
-        self.visuals = [visual for visual in model.visuals if visual.kind != "mesh"]
+        self.visuals = model.visuals
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
         self.newest: LivePose | None = None  # to draw; None: the N-pose
         self.info: StreamInfo | None = None  # of the poses; None before the start

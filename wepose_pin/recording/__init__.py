@@ -144,8 +144,6 @@ CONFIGURATION = "configuration"
 RATE_ERROR = 0.01  # allowed relative error of the stated rate; it is the relative error of all angles
 LONGEST_STEP = 2.5  # allowed step between two times, in steps of the rate; readers resample uneven clocks
 
-EACH_TIME = ", a row for each time"  # part of an error's text on an array's shape
-
 
 class Mark(NamedTuple):
     """A text that was marked at a time."""
@@ -370,13 +368,13 @@ def check_recording(recording: Recording) -> Recording:
     for segment, sensor in recording.sensors.items():
         place, count = f"{where}: sensors.{segment}", len(time)
         if isinstance(sensor, ImuSensor):
-            check_array(f"{place}.gyro", sensor.gyro_S, (count, 3), EACH_TIME)
-            check_array(f"{place}.accel", sensor.accel_S, (count, 3), EACH_TIME)
+            check_array(f"{place}.gyro", sensor.gyro_S, (count, 3))
+            check_array(f"{place}.accel", sensor.accel_S, (count, 3))
         else:
-            check_array(f"{place}.orientation", sensor.quat_VS, (count, 4), EACH_TIME, unit=1e-6)
+            check_array(f"{place}.orientation", sensor.quat_VS, (count, 4), unit=1e-6)
         if sensor.stated_quat_LS is not None:
             check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
         if sensor.gap is not None:
-            check_array(f"{place}.gap", sensor.gap, (count,), EACH_TIME, flags=True)
+            check_array(f"{place}.gap", sensor.gap, (count,), flags=True)
     check_phases(where, time, recording.phases)
     return recording

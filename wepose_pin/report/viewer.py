@@ -106,7 +106,7 @@ def _place_body(
     if q is None:
         q = solve_configuration(model, {segment: quat_WL[samples] for segment, quat_WL in pose.quat_WL.items()})
     known = set(find_known_links(model, pose.quat_WL))
-    visuals = [visual for visual in model.visuals if visual.link in known and visual.kind != "mesh"]
+    visuals = [visual for visual in model.visuals if visual.link in known]
     return visuals, compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
 
 
