@@ -123,26 +123,32 @@ def is_number(value: Any, below: float = 1e300) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < below
 
 
-def toml_string(text: str) -> str:
-    """Format a text for TOML: as JSON, with characters replaced that cannot be encoded, and DEL escaped."""
-    sound = text.encode("utf-8", "replace").decode("utf-8")
+def format_value(value: Any) -> str:
+    """Format a value for TOML; characters that cannot be encoded are replaced, a mapping is an inline table."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{toml_key(name)} = {format_value(each)}' for name, each in value.items())} }}"
+    if isinstance(value, list | tuple):
+        is_matrix = value and isinstance(value[0], list) and len(value[0]) > 3  # its rows stand one below the other
+        separator = ",\n    " if is_matrix else ", "
+        return f"[{separator.join(map(format_value, value))}]"
+    sound = value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value
     return json.dumps(sound, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def toml_key(name: str) -> str:
     """Format a key for TOML: names of links and joints in a URDF may have any characters."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_string(name)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else format_value(name)
 
 
 def format_toml(values: Mapping[str, Any], place: str = "") -> Iterator[str]:
-    """Yield the lines of a TOML table: `values` are texts in TOML, and tables of those by name; tables come last."""
+    """Yield the lines of a TOML table: values, then tables of those by name."""
     for name, value in values.items():
-        if isinstance(value, str):
-            yield f"{toml_key(name)} = {value}"
+        if not isinstance(value, Mapping):
+            yield f"{toml_key(name)} = {format_value(value)}"
     for name, value in values.items():
-        if not isinstance(value, str):
+        if isinstance(value, Mapping):
             heading = f"{place}{toml_key(name)}"
-            if not value or any(isinstance(each, str) for each in value.values()):
+            if not value or any(not isinstance(each, Mapping) for each in value.values()):
                 yield from ("", f"[{heading}]")
             yield from format_toml(value, f"{heading}.")
 
@@ -255,35 +261,33 @@ def _convert(value: Any, key: Key) -> Any:
 
 
 def format_record(record: Any) -> dict[str, Any]:
-    """Return key → its value in TOML, for `format_toml`; None, false and what is empty are left out."""
+    """Return key → its value in a file, for `format_toml`; None, false and what is empty are left out."""
     values: dict[str, Any] = {}
     for name, (_, key) in _find_keys(record.__class__).items():
         value = getattr(record, name)
         if isinstance(value, np.ndarray):
-            values |= _format_value(key, value)
+            values |= _revert(value, key)
         elif value or isinstance(value, float):
-            values[key.name] = _format_value(key, value)
+            values[key.name] = _revert(value, key)
     return values
 
 
-def _format_value(key: Key, value: Any) -> Any:
+def _revert(value: Any, key: Key) -> Any:
     if isinstance(value, Mapping):
-        return {name: _format_value(key, each) for name, each in value.items()}
+        return {name: _revert(each, key) for name, each in value.items()}
     if hasattr(value, "_fields"):
         return format_record(value)
     if isinstance(value, np.ndarray):
-        return dict(zip(key.each, (_format_value(key, float(each)) for each in value), strict=True))
+        return dict(zip(key.each, (_revert(float(each), key) for each in value), strict=True))
     if key.words:
-        return toml_string(next(word for word, meaning in key.words.items() if meaning == value))
+        return next(word for word, meaning in key.words.items() if meaning == value)
     if isinstance(value, tuple):
-        return f"[{', '.join(_format_value(key, each) for each in value)}]"
-    if isinstance(value, str):
-        return toml_string(value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    if key.unit in _TO_SI:
-        value = round(value / _TO_SI[key.unit], 6 if key.digits is None else key.digits)
-    return repr(float(value)) if key.digits is None else f"{value:.{key.digits}f}"
+        return tuple(_revert(each, key) for each in value)
+    if isinstance(value, str | bool):
+        return value
+    digits = 6 if key.digits is None and key.unit in _TO_SI else key.digits
+    value = float(value) / _TO_SI.get(key.unit, 1.0)
+    return value if digits is None else round(value, digits)
 
 
 # Atomic output -------------------------------------------------------------------------------------------------------

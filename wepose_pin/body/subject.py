@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import NonNegative, Range, check_arguments, check_array, check_fields, check_names
-from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml, toml_string, whole_file
+from ..documents import Key, TomlTable, format_record, format_toml, read_record, read_toml, whole_file
 from ..errors import BadData, BadModel, BadOption, BadSubject
 from .body import BodyModel
 from .girdle import PARAMETERS
@@ -330,15 +330,14 @@ def population_subject(
 
 def subject_toml(subject: Subject) -> str:
     """Return the text of ``subject.toml``."""
-    values = {"format": str(FORMAT), "lengths": {}, **format_record(subject)}
+    values = {"format": FORMAT, "lengths": {}, **format_record(subject)}
     for segment in subject.mounts:
         if (cov := subject.mount_covariance(segment)) is not None:
-            values["mounts"][segment]["std_deg"] = f"{np.degrees(np.sqrt(np.trace(cov) / 3.0)):.3f}"
+            values["mounts"][segment]["std_deg"] = round(float(np.degrees(np.sqrt(np.trace(cov) / 3.0))), 3)
     if subject.order:
-        values["lengths_std"] = {name: f"{subject.std(name):.6f}" for name in subject.lengths if name in subject.order}
-        rows = [f"    [{', '.join(f'{v:.9e}' for v in row)}],\n" for row in subject.covariance]
-        order = f"[{', '.join(map(toml_string, subject.order))}]"
-        values["covariance"] = {"order": order, "matrix": f"[\n{''.join(rows)}]"}
+        values["lengths_std"] = {name: round(subject.std(name), 6) for name in subject.lengths if name in subject.order}
+        matrix = [[float(f"{v:.9e}") for v in row] for row in subject.covariance]
+        values["covariance"] = {"order": subject.order, "matrix": matrix}
     return "\n".join([_COMMENT, *format_toml(values)]) + "\n"
 
 

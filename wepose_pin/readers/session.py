@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import polars as pl
 from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..documents import Finite, Key, TomlTable, is_number, read_record, read_toml, toml_key, toml_string
+from ..documents import Finite, Key, TomlTable, format_value, is_number, read_record, read_toml, toml_key
 from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printable
 from ..recording import (
     CONFIGURATION,
@@ -182,17 +181,9 @@ def _check_columns(keys: Mapping[str, SensorKeys]) -> None:
 def format_keys(keys: Mapping[str, Any], checks: Mapping[str, str] = MappingProxyType({})) -> list[str]:
     """Format the keys of a table, one a line; `checks`: key → what the user has to check there."""
     return [
-        f"{toml_key(key)} = {_format_value(value)}" + (f"   # CHECK: {checks[key]}" if key in checks else "")
+        f"{toml_key(key)} = {format_value(value)}" + (f"   # CHECK: {checks[key]}" if key in checks else "")
         for key, value in keys.items()
     ]
-
-
-def _format_value(value: Any) -> str:
-    if isinstance(value, str):
-        return toml_string(value)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_format_value, value))}]"
-    return f"{{ {', '.join(format_keys(value))} }}" if isinstance(value, Mapping) else json.dumps(value)
 
 
 # The recording -----------------------------------------------------------------------------------------------------
