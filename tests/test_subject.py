@@ -53,7 +53,7 @@ def test_the_file_gives_back_what_a_calibration_found(tmp_path: Path) -> None:
             np.testing.assert_allclose(again.mounts[name], subject.mounts[name], atol=1e-9)
             stood, offset = (each.start_pose_offset[name] for each in (again, subject))
             np.testing.assert_allclose(stood, offset, atol=1e-5)
-            assert again.heading_drift[name] == pytest.approx(subject.heading_drift[name], rel=1e-3, abs=1.5e-8)
+            assert again.heading_drift[name] == pytest.approx(subject.heading_drift[name], rel=1e-3, abs=1e-8)
         for name, hinge in subject.hinges.items():
             np.testing.assert_allclose(again.hinges[name].axis, hinge.axis, atol=1e-6)
             assert again.hinges[name].std == pytest.approx(hinge.std, rel=1e-3)

@@ -50,6 +50,7 @@ Positive = Annotated[float, Range(0.0, closed=False)]
 NonNegative = Annotated[float, Range(0.0, closed=True)]
 PositiveOrInfinite = Annotated[float, Range(0.0, closed=False, high=math.inf)]
 Count = Annotated[int, Range(0.0, closed=True)]
+EACH_TIME = ", a row for each time"  # part of an error's text on an array's shape
 
 
 # Annotation → class of the values that it takes, and what it takes in words.
@@ -153,19 +154,19 @@ def _show(value: Any) -> str:
 
 
 def check_array(
-    place: str, values: Any, shape: tuple[int, ...], *, flags: bool = False, missing: bool = False, unit: float = np.inf
+    place: str, values: Any, shape: tuple[int, ...], rows: str = "", *, kind: str = "number", unit: float = np.inf
 ) -> None:
-    """Raise `BadData` where `values` is no array of that shape of finite numbers, or NaN where they may be `missing`.
+    """Raise `BadData` where `values` is no array of that shape of finite numbers; `rows` ends the text on a shape.
 
-    `flags`: an array of bool is needed; `unit`: by how much the length of quaternions (…, 4) or directions (…, 3) may
-    differ from 1
+    `kind`: also "missing", numbers or NaN, and "flag", bool; `unit`: by how much the length of quaternions (…, 4) or
+    directions (…, 3) may differ from 1
     """
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in ("b" if flags else "fiu"):
-        kind = "bool" if flags else "real numbers"
-        raise BadData(f"{place} = {_show(values)}: a NumPy array of {kind}, {shape}, is needed")
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in ("b" if kind == "flag" else "fiu"):
+        needed = "bool" if kind == "flag" else "real numbers"
+        raise BadData(f"{place} = {_show(values)}: a NumPy array of {needed}, {shape}, is needed")
     if values.shape != shape:
-        raise BadData(f"{place} has the shape {values.shape}; {shape} is needed")
-    wrong = np.isinf(values) if missing else ~np.isfinite(values)
+        raise BadData(f"{place} has the shape {values.shape}; {shape} is needed{rows}")
+    wrong = np.isinf(values) if kind == "missing" else ~np.isfinite(values)
     if wrong.any():
         k = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise BadData(f"{place}[{', '.join(map(str, k))}] = {values[k]:g}: a finite number is needed")

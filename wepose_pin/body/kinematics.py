@@ -14,7 +14,7 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..arguments import check_array, check_fields, check_names
+from ..arguments import EACH_TIME, check_array, check_fields, check_names
 from ..errors import BadData, BadModel, one_of
 from ..recording import check_time, format_span
 from ..rotations import unwrap_signs
@@ -75,7 +75,7 @@ class Pose:
         """Check all fields and return the pose; NaN stands for missing values. Raise `BadOption` or `BadData`."""
         where, n = "pose: ", np.size(self.time)
         check_fields(self, where)
-        check_array(f"{where}time", self.time, (n,), missing=True)
+        check_array(f"{where}time", self.time, (n,), kind="missing")
         if not n:
             raise BadData(f"{where}time has no samples")
         check_time("pose", self.time)
@@ -89,8 +89,8 @@ class Pose:
         ):
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
-                place = f"{where}{name}.{key}"
-                check_array(place, values, shape, flags=name == "gap", missing=True, unit=unit)
+                kind = "flag" if name == "gap" else "missing"
+                check_array(f"{where}{name}.{key}", values, shape, EACH_TIME, kind=kind, unit=unit)
         return self
 
 

@@ -35,7 +35,7 @@ MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person ha
 # Limits of a file; whether numbers are plausible says the quality of the calibration.
 _OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4, each=("x_deg", "y_deg", "std_deg"))
 # Of a heading: up to 100 deg/s.
-_DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=4, each=("rate_deg_min", "std_deg_min"))
+_DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=5, each=("rate_deg_min", "std_deg_min"))
 _UNIT = Key(least=-1.001, most=1.001, digits=9)  # of a component of a unit vector
 _MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",))
 _GIRDLE = Key(least=-LONGEST, most=LONGEST, each=PARAMETERS, digits=6)

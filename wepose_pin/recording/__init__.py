@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..arguments import Positive, check_array, check_fields, check_value
+from ..arguments import EACH_TIME, Positive, check_array, check_fields, check_value
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, one_of
@@ -349,7 +349,7 @@ def check_recording(recording: Recording) -> Recording:
         raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
     if len(time) < 2:
         raise BadData(f"{where}: time has {len(time)} samples; a recording has at least 2")
-    check_array(f"{where}: time", time, (len(time),), missing=True)
+    check_array(f"{where}: time", time, (len(time),), kind="missing")
     check_time(where, time)
     steps, seconds = len(time) - 1, float(time[-1] - time[0])
     if abs(seconds * recording.rate_hz - steps) > max(1.0, RATE_ERROR * steps):
@@ -368,13 +368,13 @@ def check_recording(recording: Recording) -> Recording:
     for segment, sensor in recording.sensors.items():
         place, count = f"{where}: sensors.{segment}", len(time)
         if isinstance(sensor, ImuSensor):
-            check_array(f"{place}.gyro", sensor.gyro_S, (count, 3))
-            check_array(f"{place}.accel", sensor.accel_S, (count, 3))
+            check_array(f"{place}.gyro", sensor.gyro_S, (count, 3), EACH_TIME)
+            check_array(f"{place}.accel", sensor.accel_S, (count, 3), EACH_TIME)
         else:
-            check_array(f"{place}.orientation", sensor.quat_VS, (count, 4), unit=1e-6)
+            check_array(f"{place}.orientation", sensor.quat_VS, (count, 4), EACH_TIME, unit=1e-6)
         if sensor.stated_quat_LS is not None:
             check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
         if sensor.gap is not None:
-            check_array(f"{place}.gap", sensor.gap, (count,), flags=True)
+            check_array(f"{place}.gap", sensor.gap, (count,), EACH_TIME, kind="flag")
     check_phases(where, time, recording.phases)
     return recording
