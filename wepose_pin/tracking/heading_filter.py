@@ -223,7 +223,7 @@ class HeadingFilter:
         self._shape_cov = subject.shape_covariance(model.table)
         # What care adds to the information (k,) [1/rad²] of the start pose.
         self._care_information = (CAREFUL_SHARE**-2 - 1.0) / self.start_var
-        self._set_start_covariance()
+        self.reset(np.zeros(k))
         # Recent misfit e of each joint's accelerations, with its force f: sums of e fᵀ (9), e² (3) and f² (3) [m²/s⁴]
         # over samples, in which older ones count less, and how many count.
         self._misfits = np.zeros((len(self.pairs), 16))
@@ -233,14 +233,10 @@ class HeadingFilter:
         self._clasped_before = False  # whether the palms were joined in the last knot
 
     def reset(self, headings: np.ndarray) -> None:
-        """Set δ (k,) [rad] as known to within the start pose."""
-        self.x[self._columns["heading"]], self.x[self._columns["start"]] = headings, 0.0
-        self._set_start_covariance()
-
-    def _set_start_covariance(self) -> None:
-        """Set the covariance of δ = s − ε_z, of the mounts' ε_z and of the segments' s after a start pose."""
+        """Set δ = s − ε_z (k,) [rad] after a start pose with errors s, with the errors ε_z of mounts."""
         P, start_var, mount_var = self.P, self.start_var, self.mount_var
         heading, mount, start = (self._columns[name] for name in ("heading", "mount", "start"))
+        self.x[heading], self.x[start] = headings, 0.0
         for columns in (heading, mount, start):
             P[columns, :], P[:, columns] = 0.0, 0.0
         P[heading, heading], P[mount, mount], P[start, start] = start_var + mount_var, mount_var, start_var

@@ -421,12 +421,9 @@ class Tracker:
 
     def _reset(self, recent: np.ndarray) -> None:
         """Reset the headings by recent orientations (m, k, 4)."""
-        same_sign = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
-        mean = same_sign.sum(axis=0)
-        mean /= np.linalg.norm(mean, axis=1)[:, None]
         for i, name in enumerate(self.names):
             R_WS_start = self._start_pose.to_world(name, Rotation.from_quat(self._quat_LS[i]))
-            self._heading_offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
+            self._heading_offset[i] = compute_heading_offset(Rotation.from_quat(recent[:, i]).mean(), R_WS_start)
         if self._headings is None:
             self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
         else:
