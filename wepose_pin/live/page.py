@@ -35,7 +35,7 @@ from ..body import BodyModel
 from ..body.configuration import KinematicsSolver
 from ..body.kinematics import find_known_links
 from ..errors import BadOption
-from ..report.viewer import DARK, LIGHT, choose_trail_colour, fill_page, find_floor, scene, view
+from ..report.viewer import choose_trail_colour, fill_page, find_floor, scene, view
 from ..retargeting.targets import find_person_arm
 from ..retargeting.visuals import MeshPart, build_parts, place_beside_person
 from .sources.udp import LOOPBACK, name_host
@@ -318,12 +318,11 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
     links, body = encoder.links, encoder.body_links
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(body), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = encoder.neutral[:, 9:]
-    floor = find_floor(model)
     content = {
         "id": encoder.identity,
         "links": list(links),
         "scene": scene(encoder.visuals, links, encoder.meshes),
-        "backdrops": {"light": {**LIGHT, "floor": floor}, "dark": {**DARK, "floor": floor}},
+        "floor": find_floor(model),
         "view": view(encoder.visuals, body, motion, encoder.reach),
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }

@@ -34,22 +34,10 @@ if TYPE_CHECKING:
 
 FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips, of a body without feet
 FEET_Z = -0.6  # [m] below which a point of a person is at a foot
-CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
 FRAMES_A_SECOND = 30.0
 MOST_FRAMES = 20_000  # of a page; the browser interpolates
 MOST_POSES = 150  # by which the camera is placed
-FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
-LIGHTS = (  # meshcat's own; positions in W [m]
-    ("AmbientLight", 0.66, None),
-    ("FillLight", 0.20, None),
-    ("PointLightNegativeX", 0.50, (2.5, 2.0, 2.6)),
-    ("PointLightPositiveX", 0.16, (1.0, -3.0, 1.0)),
-)
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
-# Colours behind the body, red, green, blue from 0 to 1.
-LIGHT = {"top": (0.985, 0.99, 0.995), "bottom": (0.89, 0.91, 0.935), "grid": (0.70, 0.74, 0.79)}
-DARK = {"top": (0.085, 0.105, 0.130), "bottom": (0.135, 0.160, 0.190), "grid": (0.30, 0.34, 0.39)}
-
 
 Phases: TypeAlias = Mapping[str, Sequence[tuple[float, float]]]  # name → spans (begin, end) [s]
 Trails: TypeAlias = Mapping[str, tuple[np.ndarray, str]]  # point → its way (n, 3) [m] in W, may hold NaN; colour in CSS
@@ -194,7 +182,7 @@ def view_html(
         "phases": [{"name": name, "spans": [[*map(float, span)] for span in each]} for name, each in phases.items()],
         "view": view([*drawn, *map(_find_box, meshes)], links, motion, [way for way, _ in trails.values()]),
         "scene": scene(drawn, links, meshes),
-        "backdrop": {**LIGHT, "floor": floor_z},
+        "floor": floor_z,
     }
     return fill_page("report/templates/view.html.j2", data, title)
 
@@ -212,7 +200,7 @@ def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
 
 
 def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[MeshPart] = ()) -> dict[str, Any]:
-    """Lights, camera and body as static/viewer.js builds them; a part's link is its place in `links`."""
+    """The body as static/viewer.js builds it; a part's link is its place in `links`."""
     parts = [
         {
             "link": links.index(visual.link),
@@ -233,8 +221,7 @@ def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[MeshPa
         }
         for mesh in meshes
     ]
-    lights = [{"name": name, "intensity": value, "position": position} for name, value, position in LIGHTS]
-    return {"fov_deg": FIELD_OF_VIEW_DEG, "lights": lights, "parts": parts, "meshes": solids}
+    return {"parts": parts, "meshes": solids}
 
 
 def _find_box(mesh: MeshPart) -> Visual:
@@ -245,11 +232,8 @@ def _find_box(mesh: MeshPart) -> Visual:
 
 def view(
     visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]
-) -> dict[str, Any]:
-    """What the camera shows: the direction from which it looks at first, and the motion's outermost points [m] in W.
-
-    A visual counts as the ball around it.
-    """
+) -> list[list[float]]:
+    """The motion's outermost points [m] in W, which the camera shows; a visual counts as the ball around it."""
     directions = np.array([*product((-1.0, -0.4, 0.4, 1.0), repeat=3), *np.eye(3), *-np.eye(3)]).T
     directions /= np.linalg.norm(directions, axis=0)
     balls_W = [(np.zeros((1, 3)), 0.0), *((trail[:: max(1, len(trail) // (4 * MOST_POSES))], 0.0) for trail in trails)]
@@ -266,7 +250,7 @@ def view(
     centres_W, radii = centres_W[known], radii[known]
     outermost = np.argmax(centres_W @ directions + radii[:, None], axis=0)
     points_W = centres_W[outermost] + radii[outermost, None] * directions.T
-    return {"toward": CAMERA_FROM, "points": np.round(points_W, 4).tolist()}
+    return np.round(points_W, 4).tolist()
 
 
 def choose_trail_colour(point: str, model: BodyModel) -> str:

@@ -15,7 +15,7 @@ const skins = body.map((link) => {
   return found;
 });
 const darkScreen = matchMedia("(prefers-color-scheme: dark)");
-const backdrop = (name) => setBackdrop(viewer, data.backdrops[name]);
+const backdrop = (name) => setBackdrop(viewer, BACKDROPS[name], data.floor);
 const screenBackdrop = () => backdrop(darkScreen.matches ? "dark" : "light");
 darkScreen.addEventListener("change", screenBackdrop);
 screenBackdrop();

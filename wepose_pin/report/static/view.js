@@ -7,7 +7,7 @@ const BAND_COLOURS = ["#a9cbe8", "#f1cf8f", "#aed8ae", "#dbb6dc", "#efb3a4", "#a
 const stage = $("stage");
 const viewer = openViewer(stage);
 const body = buildScene(viewer, data.scene, data.links);
-setBackdrop(viewer, data.backdrop);
+setBackdrop(viewer, BACKDROPS.light, data.floor);
 
 // ---- the motion: frame k is at times[k], a link's frame is quaternion xyzw and position
 const times = floats(data.offsets), motion = floats(data.motion), n = times.length;
@@ -70,7 +70,7 @@ const trails = data.trails.map((trail) => new Trail(trail));
 
 // ---- the camera
 const VIEWS = { Front: [1, 0, 0.05], Side: [0, -1, 0.05], Top: [-0.001, 0, 1] };   // from where, in W
-let from = data.view.toward;
+let from = CAMERA_FROM;
 const fit = () => fitCamera(viewer, stage, data.view, 80, from);
 let moved = false;                                                       // by the user: then a resize leaves it alone
 viewer.controls.addEventListener("start", () => { moved = true; });
@@ -149,7 +149,7 @@ $("anglesShown").addEventListener("click", () => {
   $("angles").hidden = !$("angles").hidden;
   $("anglesShown").setAttribute("aria-pressed", !$("angles").hidden);
 });
-$("reset").addEventListener("click", () => { from = data.view.toward; moved = false; fit(); });
+$("reset").addEventListener("click", () => { from = CAMERA_FROM; moved = false; fit(); });
 slider.addEventListener("input", () => { now = Number(slider.value); show(); });
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;

@@ -1,6 +1,16 @@
 // What the page of a recording and the live page share: meshcat's viewer in a box, ribbons, the camera.
 const THREE = MeshCat.THREE;
 const $ = (id) => document.getElementById(id);
+const CAMERA_FROM = [2.1, 1.25, 0.55];                                   // from the person in W: front-left, slightly above
+const FIELD_OF_VIEW_DEG = 28;                                            // a long lens: near hands do not look larger
+const LIGHTS = [                                                         // meshcat's own: intensity, position in W [m]
+  ["AmbientLight", 0.66], ["FillLight", 0.20],
+  ["PointLightNegativeX", 0.50, [2.5, 2.0, 2.6]], ["PointLightPositiveX", 0.16, [1.0, -3.0, 1.0]],
+];
+const BACKDROPS = {                                                      // red, green, blue behind the body
+  light: { top: [0.985, 0.99, 0.995], bottom: [0.89, 0.91, 0.935], grid: [0.70, 0.74, 0.79] },
+  dark: { top: [0.085, 0.105, 0.130], bottom: [0.135, 0.160, 0.190], grid: [0.30, 0.34, 0.39] },
+};
 
 function bytes(base64) {
   const text = atob(base64), out = new Uint8Array(text.length);
@@ -27,8 +37,8 @@ const floats = (base64) => new Float32Array(bytes(base64).buffer);
 function buildScene(viewer, scene, links) {
   viewer.set_property(["Axes"], "visible", false);
   viewer.set_property(["Grid"], "visible", false);
-  viewer.set_property(["Cameras", "default", "rotated", "<object>"], "fov", scene.fov_deg);
-  scene.lights.forEach(({ name, intensity, position }) => {
+  viewer.set_property(["Cameras", "default", "rotated", "<object>"], "fov", FIELD_OF_VIEW_DEG);
+  LIGHTS.forEach(([name, intensity, position]) => {
     viewer.set_property(["Lights", name], "visible", true);
     viewer.set_property(["Lights", name, "<object>"], "intensity", intensity);
     if (position) viewer.set_property(["Lights", name, "<object>"], "position", position);
@@ -65,7 +75,7 @@ function buildScene(viewer, scene, links) {
 
 // Background and ground grid, which fades into it, in place of those before.
 const GRID_CELL = 0.25, GRID_RADIUS = 3;                                 // [m]
-function setBackdrop(viewer, { top, bottom, grid, floor }) {
+function setBackdrop(viewer, { top, bottom, grid }, floor) {           // floor: height of the ground in W [m]
   viewer.set_property(["Background"], "top_color", top);
   viewer.set_property(["Background"], "bottom_color", bottom);
   const points = [], colours = [];
@@ -131,10 +141,10 @@ class Ribbon {
 
 // The camera as near as it can be with every point of the motion in the picture, seen from a direction in W; headroom
 // [px] for a title.
-function fitCamera(viewer, stage, view, headroom, from = view.toward) {
+function fitCamera(viewer, stage, view, headroom, from = CAMERA_FROM) {
   const toward = new THREE.Vector3(...from).normalize(), across = new THREE.Vector3(0, 0, 1).cross(toward).normalize();
   const axes = [across, toward.clone().cross(across), toward];            // right, up, toward the camera, in W
-  const points = view.points.map((point) => axes.map((axis) => axis.dot(new THREE.Vector3(...point))));
+  const points = view.map((point) => axes.map((axis) => axis.dot(new THREE.Vector3(...point))));
   const tall = 0.96 * Math.tan(THREE.MathUtils.degToRad(viewer.camera.fov / 2));
   const wide = tall * stage.clientWidth / stage.clientHeight;
   const tallUp = tall * (1 - Math.min(headroom / stage.clientHeight, 0.5));
