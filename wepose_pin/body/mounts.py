@@ -154,11 +154,8 @@ def find_mount_covariance(
 def compute_start_heading_var(
     recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
 ) -> float:
-    """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
-
-    It is zero for the segment whose heading defines x. A calibrated mount contains the heading error of the
-    calibration's start pose, so that only the variance between two start poses of one person is left.
-    """
+    """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset; 0: it defines x."""
+    # A calibrated mount contains the heading error of its start pose; what differs between two of them is left.
     is_calibrated = find_mount_covariance(recording, segment, subject) is not None
     is_reference = segment == start_pose.table.reference
     return 0.0 if is_reference else float(start_pose.std(segment, again=is_calibrated)[2] ** 2)

@@ -299,7 +299,7 @@ def show_result(guide: Guide, _: bool) -> StepRun:
         calibration, reason = None, ""
         try:
             calibration = future.result()
-        except WeposeError as error:
+        except (WeposeError, OSError) as error:
             reason = str(error)
         if entered and reason:  # then without it
             del guide.measured[entered]
@@ -311,7 +311,7 @@ def show_result(guide: Guide, _: bool) -> StepRun:
             if asked is ACCEPT and calibration is not None:
                 try:
                     guide.accept(calibration, path.with_suffix(""))
-                except ExistingOutput as error:  # such as a full disk: the person may try again
+                except (ExistingOutput, OSError) as error:  # such as a full disk: the person may try again
                     note = str(error)
             elif asked is not None:
                 try:
