@@ -22,7 +22,7 @@ SCATTER_LOG_STD = 0.5
 # Its logarithm scatters, and, assumption, that of a segment against the person's own does.
 USUAL_POSE_SHARE, POSE_LOG_STD = 0.78, 0.35
 SHOWN = 0.5  # times its standard deviation among people, to which the motion must show a tilt
-LEAST_POSE_SHARE = 0.3  # nobody stands more exactly
+LEAST_POSE_SHARE = 0.25  # nobody stands more exactly
 
 
 def estimate_scatter(hinge_stds: Collection[float]) -> float:
@@ -37,7 +37,7 @@ def estimate_scatter(hinge_stds: Collection[float]) -> float:
 
 
 def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> float:
-    """Estimate how far a person is off the start pose, as a share of that among all people.
+    """Estimate how far a person is off the start pose, as a share of what the table states of people.
 
     It follows from the tilts that the motion shows, as those of arms by their hinges, by empirical Bayes. `offsets` is
     `Subject.start_pose_offset`.
@@ -50,7 +50,8 @@ def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> 
     if not squares or table.is_mechanism:
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + POSE_LOG_STD**2)
-    return max(float((np.sqrt(np.mean(squares)) / USUAL_POSE_SHARE) ** weight), LEAST_POSE_SHARE)
+    share = USUAL_POSE_SHARE * float(np.sqrt(np.mean(squares)) / USUAL_POSE_SHARE) ** weight
+    return max(share, LEAST_POSE_SHARE)
 
 
 def make_personal(tissue: SoftTissue, share: float, lag: float, scatter: float) -> SoftTissue:
