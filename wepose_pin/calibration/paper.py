@@ -53,22 +53,17 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     """
     _check_problem(problem)
     recording, prior = problem.recording, problem.prior
-    mounts, headings, mount_diagnostics = align_sensors(recording, prior, problem.R_VS_start, problem.start)
+    mounts, _, mount_diagnostics = align_sensors(recording, prior, problem.R_VS_start, problem.start)
     data, condition_index, samples = problem.observe()
-    quat_WL = {
-        name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
-        for name, R_VS in problem.R_VS.items()
-    }
+    quat_WL = problem.orient_segments({name: mount.as_quat() for name, mount in mounts.items()}, samples)
     names = problem.layout.lengths
     A = np.zeros((len(samples), 3, len(names)))
     for k, closure in enumerate(problem.protocol.closures):
         own, [path] = condition_index == k, problem.layout.paths[closure]
         for segment, (B, _) in path.vectors.items():
             A[own] += Rotation.from_quat(quat_WL[segment][own]).as_matrix() @ B
-    rows, advice = (
-        A.reshape(-1, len(names)),
-        "check that the hands do in the phase what the protocol says, and every mount",
-    )
+    rows = A.reshape(-1, len(names))
+    advice = "check that the hands do in the phase what the protocol says, and every mount"
     E, d, d_cov = _state_constraints(problem)
     Z = null_space(E)
     if np.linalg.matrix_rank(rows @ Z, rtol=LEAST_EFFECT) < Z.shape[1]:

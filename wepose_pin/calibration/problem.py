@@ -71,12 +71,10 @@ class CalibrationProblem:
 
     @property
     def protocol(self) -> Protocol:
-        """What the person did in which phase."""
         return self.layout.protocol
 
     @property
     def model(self) -> BodyModel:
-        """The body."""
         return self.layout.model
 
     @property

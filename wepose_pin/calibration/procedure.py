@@ -171,10 +171,8 @@ def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, me
     """Raise where body, protocol, sensors and measured lengths do not fit each other."""
     check_segments(model.table, recording.sensors, f"{recording.where()}: sensors.", BadSession)
     if not model.table.lengths:
-        raise BadModel(
-            f"{model.table.where}: this body has no lengths; a table beside the URDF names its points and [lengths], "
-            f"as docs/models.md shows"
-        )
+        remedy = "a table beside the URDF names its points and [lengths], as docs/models.md shows"
+        raise BadModel(f"{model.table.where}: this body has no lengths; {remedy}")
     protocol.check_body(model.table)
     names, (low, high) = (*model.lengths, *list_breadths(model.table)), MEASURED_RANGE
     for name, metres in measured.items():
@@ -184,10 +182,8 @@ def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, me
             raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
     for segment in protocol.needs:
         if segment not in recording.sensors:
-            raise BadSession(
-                f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
-                f"{', '.join(protocol.needs)}"
-            )
+            needs = f"protocol '{protocol.name}' needs one each on {', '.join(protocol.needs)}"
+            raise BadSession(f"{recording.where()}: no sensor on {segment}; {needs}")
 
 
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
@@ -348,19 +344,15 @@ def _estimate_hinges(fit: LeastSquares, x_cov: np.ndarray) -> tuple[dict[str, Hi
     """Return joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
     layout, hinges, hinge_rms = fit.layout, {}, {}
     spans = [span for c, span in fit.spans if isinstance(c, Closure | FreeMotion)]
-    lags = {
-        hinge.on: float(fit.x[row])
-        for hinge, row in zip(layout.twists, layout.twist, strict=True)
-        if x_cov[row, row] < MOST_LAG_STD**2
-    }
+    twists = zip(layout.twists, layout.twist, strict=True)
+    lags = {hinge.on: float(fit.x[row]) for hinge, row in twists if x_cov[row, row] < MOST_LAG_STD**2}
     for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
         if spans:
             axis = np.array(term.axis) + across * term.across + tilted * term.tilted
             axis_L = layout.start_pose.rotation(term.on).T @ axis / np.linalg.norm(axis)
             bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
             hinge_rms[term.name] = rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
-            std = max(rms, term.softness)
-            hinges[term.name] = Hinge(axis_L, std, lags.get(term.on))
+            hinges[term.name] = Hinge(axis_L, max(rms, term.softness), lags.get(term.on))
     return hinges, hinge_rms
 
 

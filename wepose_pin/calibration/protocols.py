@@ -66,11 +66,8 @@ class Closure(NamedTuple):
     @property
     def ways(self) -> tuple[tuple[tuple[str, float], ...], ...]:
         """Each way that it closes, as a signed sum of points."""
-        if self.kind == "coincide":
-            return (((self.points[0], 1.0), (self.points[1], -1.0)),)
-        if self.origin:
-            return (((self.points[0], 1.0), (self.origin, -1.0)),)
-        return tuple(((point, 1.0),) for point in self.points)
+        other = self.points[1] if self.kind == "coincide" else self.origin
+        return (((self.points[0], 1.0), (other, -1.0)),) if other else tuple(((point, 1.0),) for point in self.points)
 
 
 class Direction(NamedTuple):
@@ -161,16 +158,14 @@ class Protocol:
                     raise BadSession(f"{where}{moves} {points}; points that move against each other are needed")
                 paths[condition] = own
             elif not isinstance(condition, FreeMotion):
-                segment = condition.segment
-                for each in (segment, table.reference) if isinstance(condition, Direction) else (segment,):
+                segment, reference = condition.segment, table.reference
+                for each in (segment, reference) if isinstance(condition, Direction) else (segment,):
                     if each not in sensors:
                         raise BadSession(f"{where}no sensor on {each}, which a pose or an axis is about")
                 if isinstance(condition, Direction):
-                    condition = condition._replace(
-                        direction=start.turn(table.reference, condition.direction),
-                        reference=table.reference,
-                        along=start.turn(segment, table.segments[segment].along),
-                    )
+                    direction = start.turn(reference, condition.direction)
+                    along = start.turn(segment, table.segments[segment].along)
+                    condition = condition._replace(direction=direction, reference=reference, along=along)
                 else:
                     condition = condition._replace(axis=start.turn(segment, condition.axis))
             conditions.append(condition)
