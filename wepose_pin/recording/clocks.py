@@ -46,11 +46,6 @@ class Clock:
     step: float  # [s] the usual one
     packet: int = 1  # rows in a packet; their times were spread evenly
 
-    @property
-    def longest_bridge(self) -> float:
-        """Longest gap [s] that is bridged silently; a single lost sample always is."""
-        return max(LONGEST_GAP_S, self.step) * (1.0 + 1e-6)
-
 
 def build_clock(time: np.ndarray, place: str) -> Clock:
     """Build the clock of a sensor from the times [s] of its rows; `place` begins an error's text.
@@ -178,8 +173,9 @@ def _compute_drift(time: np.ndarray) -> float:
 def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
     """Mark every sample (n,) as `GOOD`, `BRIDGED` or `LONG`, by the length of the runs that are not `good` (n,)."""
     marks = np.full(len(good), GOOD, dtype=np.int8)
+    bridged_s = max(LONGEST_GAP_S, clock.step) * (1.0 + 1e-6)  # a single lost sample always is
     for first, last in find_runs(~good):
-        marks[first:last] = LONG if (last - first) * clock.step > clock.longest_bridge else BRIDGED
+        marks[first:last] = LONG if (last - first) * clock.step > bridged_s else BRIDGED
     return marks
 
 
