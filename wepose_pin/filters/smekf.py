@@ -131,9 +131,8 @@ def _correct(A, C, B, state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-
 @kernel
 def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
     state, model = states[0], models[0]
-    quat, bias, R, P, vertical, dt = (
-        state.quat_VS, state.gyro_bias, state.R_VS, state.P, state.about_vertical, model.dt
-    )  # fmt: skip
+    quat, bias, R, P, vertical = state.quat_VS, state.gyro_bias, state.R_VS, state.P, state.about_vertical
+    dt = model.dt
     A, C, B = _read(P[0]), _read(P[1]), _read(P[2])
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
@@ -238,12 +237,7 @@ def _fill_cross(A, v, diagonal):  # type: ignore[no-untyped-def]
     A[1, 2], A[2, 0], A[2, 1] = -v[0], -v[1], v[0]
 
 
-def _make_published_records(
-    noise: SensorNoise,
-    rate_hz: float,
-    quat_VS: np.ndarray,
-    params: None,  # noqa: ARG001
-) -> tuple[np.ndarray, ...]:
+def _make_published_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, _: None) -> tuple[np.ndarray, ...]:
     Q, R = np.zeros((6, 6)), np.zeros((6, 6))
     Q[:3, :3], Q[3:, 3:] = noise.gyro_cov, noise.bias_step_cov  # of [w_ω; w_b]
     R[:3, :3], R[3:, 3:] = noise.accel_cov, noise.gyro_cov  # of [w_g; w_ω]

@@ -126,18 +126,12 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, qu
         about_vertical[k, RATE_VAR] = variance
 
 
-def _smooth(
-    states: np.ndarray,
-    models: np.ndarray,
-    gyro_S: np.ndarray,
-    accel_S: np.ndarray,
-    static: np.ndarray,
-    *out: np.ndarray,
-) -> None:
+def _smooth(states: np.ndarray, models: np.ndarray, *arrays: np.ndarray) -> None:
     """Smooth a whole recording; each call starts anew, so that a recording cut in two is two recordings."""
     P_rows, size = states["P"][0, list(SMOOTHED_STATES), :STATES], int(models["block_samples"][0])
+    (gyro_S, _, static), out = arrays[:3], arrays[3:]
     blocks = np.empty(len(gyro_S) // size, BLOCK)
-    run(states.copy(), models, blocks, gyro_S, accel_S, static, *out)
+    run(states.copy(), models, blocks, *arrays)
     smoothed = _backward(blocks, P_rows, float(models["gravity"][0]))
     _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, static, *out)
 
