@@ -103,15 +103,8 @@ def track(
     check_arguments(track, locals() | {"subject": person})
     if person is not None and not accept_failed:
         person.check_quality()
-    tracker = Tracker(
-        person,
-        model=model,
-        method=method,
-        static_test=static_test,
-        open_loop=open_loop,
-        causal=causal,
-        limits=limits,
-    )
+    options: dict[str, Any] = {"static_test": static_test, "open_loop": open_loop, "causal": causal, "limits": limits}
+    tracker = Tracker(person, model=model, method=method, **options)
     [result] = track_chunks(tracker, recording, np.inf)
     summary = summarize(result)
     return replace(result, summary=summary.content, diagnostics=summary.diagnostics)

@@ -400,9 +400,10 @@ class HeadingFilter:
 
         The filter's start pose is that of the population. With care, its headings have `CAREFUL_SHARE` of the standard
         deviation. The likelihood of that follows in closed form from what the filter knows of the errors s of the start
-        pose, which are states. Only accelerations of joints tell that much.
+        pose, which are states. Only accelerations of joints tell that much. Causally it is 0: in the first minute they
+        do not tell which is right.
         """
-        if not self.pairs:
+        if self.causal or not self.pairs:
             return 0.0
         columns, information = self._columns["start"], self._care_information
         s, spread = x[columns], np.eye(len(columns)) + information[:, None] * P[np.ix_(columns, columns)]

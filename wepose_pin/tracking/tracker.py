@@ -105,13 +105,8 @@ class Tracker:
         check_method(method)
         if causal and method in OFFLINE:
             raise BadOption(f"method '{method}' needs the whole recording; 'amekf' looks at nothing ahead")
-        self.options = {
-            "method": method,
-            "static_test": static_test,
-            "open_loop": open_loop,
-            "causal": causal,
-            "limits": limits,
-        }
+        self.options = {"method": method, "static_test": static_test, "open_loop": open_loop}
+        self.options |= {"causal": causal, "limits": limits}
         self._method, self._static_test, self._causal, self._limits = method, static_test, causal, limits
         self._subject, self._model, self._observes_headings = subject, model, not open_loop
         self._where = ""  # begins an error's text; empty before the first chunk
