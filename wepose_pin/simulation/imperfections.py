@@ -30,10 +30,8 @@ class Imperfections:
 
     tissue_gain: float = 0.0  # sensors turn on their segments as the joints turn
     tissue_random: float = 0.0  # … at random while these move, by creep of the strap, and by acceleration across them
-    sensor_place: float = 0.0  # sensors sit half-way along a segment; at 1 at 0.6 of an upper arm and 0.85 of a forearm
-    girdle: float = (
-        0.0  # shoulders follow the arm by de Groot & Brand 2001, differ from it, wander, rest off their mean
-    )
+    sensor_place: float = 0.0  # sensors sit half-way along a segment; at 1: at 0.6 of an upper arm, 0.85 of a forearm
+    girdle: float = 0.0  # shoulders follow the arm by de Groot & Brand 2001, and each person's differ from that
     elbow: float = 0.0  # carrying angle, half in the humerus and half in the forearm, and abduction as the elbow flexes
     wrists: float = 0.0  # bend in the clasp
     start_pose: float = 0.0  # offsets of the start pose and of other poses

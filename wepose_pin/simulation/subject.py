@@ -110,15 +110,13 @@ def _sample_sensor(
 
     Return orientations (n) in W, specific force (n, 3) [m/s^2] in S, and rotation vectors of tissue (n, 3) [rad] in L.
     """
-    pose, *around = poses or _sample_poses(motion, t, [segment])
-    p_W, *others_W = (
-        each.R_WL[segment].apply(motion.p_LS[segment]) + each.origins[segment] for each in (pose, *around)
-    )
+    poses = poses or _sample_poses(motion, t, [segment])
+    p_W, *others_W = (each.R_WL[segment].apply(motion.p_LS[segment]) + each.origins[segment] for each in poses)
     # Differences to the middle first: for a static segment they are exactly zero.
     far, near, near_after, far_after = (other_W - p_W for other_W in others_W)
     accel_W = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
-    R_WL = pose.R_WL[segment]
-    soft_L = tissue(t, motion.moving_time(t, segment), pose, R_WL.inv().apply(accel_W))
+    R_WL = poses[0].R_WL[segment]
+    soft_L = tissue(t, motion.moving_time(t, segment), poses[0], R_WL.inv().apply(accel_W))
     R_WS = compose(R_WL, Rotation.from_rotvec(soft_L), R_LS)
     return R_WS, R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L
 
@@ -152,10 +150,12 @@ def simulate(
         same of the right
     seed : the same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of
         their own: noise and rate change neither motion nor mounts
+    rate_hz : samples a second
     noise : of gyroscope and accelerometer; by default that of an Xsens MTi-3, `wp.NOISE_FREE` for none
     imperfections : of subject, mounting and sensors; `wp.IDEAL_PRESET` for none, `wp.MILD_PRESET` for a careful
         subject, `wp.PEOPLE_PRESET` for the sizes that the literature reports
     clasp_s : [s] duration of the clasp, at least 5
+    circles : number of circles, 0 or more
     protocol : what the person does in the time of the clasp: "clasp", "t_pose", "bow", or several joined by "+"
 
     Returns
