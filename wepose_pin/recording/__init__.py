@@ -7,7 +7,7 @@ in these steps: `clocks` (the sensors' own times, lost samples, resampling) of a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -115,14 +115,6 @@ class OrientationSensor:
 
 
 Sensor = ImuSensor | OrientationSensor
-
-
-def join_sensors(parts: Sequence[Sensor]) -> Sensor:
-    """Join consecutive parts of one sensor; mount and range are those of the last part."""
-    signals = ("gyro_S", "accel_S") if isinstance(parts[-1], ImuSensor) else ("quat_VS",)
-    names = (*signals, "gap") if all(part.gap is not None for part in parts) else signals
-    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return replace(parts[-1], **{"gap": None} | joined)
 
 
 def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
@@ -329,8 +321,15 @@ class Recording:
 
 
 def join_recordings(first: Recording, second: Recording) -> Recording:
-    """Join two recordings of the same sensors in time; diagnostics are those of both, all else is the first's."""
-    sensors = {name: join_sensors([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
+    """Join two recordings of the same sensors in time: diagnostics of both, other fields of the first."""
+    sensors: dict[str, Sensor] = {}
+    for name in first.sensors:
+        sensor, joined = second.sensors[name], dict[str, Any](gap=None)
+        for signal in ("gyro_S", "accel_S", "gap") if isinstance(sensor, ImuSensor) else ("quat_VS", "gap"):
+            pair = [getattr(part, signal) for part in (first.sensors[name], sensor)]
+            if all(values is not None for values in pair):
+                joined[signal] = np.concatenate(pair)
+        sensors[name] = replace(sensor, **joined)
     resets = (*first.resets, *(len(first) + tick for tick in second.resets))
     diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
     time = np.concatenate([first.time, second.time])

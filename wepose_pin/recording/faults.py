@@ -182,13 +182,11 @@ def may_have_faults(values):  # type: ignore[no-untyped-def]
             return True
     for row in range(1, len(values), FROZEN_SAMPLES - 1):
         if is_same(values[row - 1], values[row]):
-            first = last = row
-            while first > 0 and is_same(values[first - 1], values[row]):
-                first -= 1
-            while last < len(values) and is_same(values[last], values[row]):
-                last += 1
-            if last - first >= FROZEN_SAMPLES:
-                return True
+            run = 0
+            for other in range(max(0, row - FROZEN_SAMPLES), min(len(values), row + FROZEN_SAMPLES)):
+                run = run + 1 if is_same(values[other], values[row]) else 0
+                if run == FROZEN_SAMPLES:
+                    return True
     return False
 
 
