@@ -179,7 +179,7 @@ def live(
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
                 driven = RobotOutput(commands, receiver, samples.sensors, worn.subject, body.table, factor)
                 outputs.insert(0, driven)
-                if not commands.checks_contact:
+                if not commands.collision.pairs:
                     print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
             if served is not None and (guide or driven is not None):
                 served.set_body(body, driven)

@@ -14,7 +14,7 @@ from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
     from ..angles.movement import Movement
-    from ..evaluation import Evaluation, Registration
+    from ..evaluation import Evaluation
 
 DECIMALS = 4  # of tables of angles; degrees and seconds
 
@@ -163,8 +163,16 @@ def _print_errors(errors: Evaluation) -> None:
     from ..recording import format_span
 
     say(f"{errors.samples} samples from {format_span(errors.interval)}")
-    if errors.registration is not None:
-        _say_registration(errors.registration)
+    if (registration := errors.registration) is not None:
+        say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
+        fitted = registration.correlation == registration.correlation  # NaN where the offset was stated
+        clock = f"speeds correlate by {registration.correlation:.3f}" if fitted else "stated"
+        say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
+        say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
+        say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
+        if registration.frames_deg:
+            frames = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
+            say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {frames}")
     rows: list[tuple[str, ...]] = []
     for name, error in errors.attitude.items():
         axes = (f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw))
@@ -199,21 +207,6 @@ def _print_errors(errors: Evaluation) -> None:
             for name, u in {**errors.attitude_uncertainty, **points}.items()
         ],
     )
-
-
-def _say_registration(registration: Registration) -> None:
-    """Say how the reference was brought to the result, and by which seconds."""
-    from ..recording import format_span
-
-    say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
-    known = registration.correlation == registration.correlation  # NaN where the offset was stated
-    clock = f"speeds correlate by {registration.correlation:.3f}" if known else "stated"
-    say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
-    say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
-    say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
-    if registration.frames_deg:
-        angles = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
-        say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {angles}")
 
 
 @described_by("writers/export.py:export")

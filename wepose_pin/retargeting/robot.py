@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import coal
@@ -60,11 +59,7 @@ class Robot:
 
     def configuration(self, u: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration `q` of `model`: a continuous joint has cosine and sine there."""
-        return u if self.model.nq == self.model.nv else pin.integrate(self.model, self._neutral, u)
-
-    @cached_property
-    def _neutral(self) -> np.ndarray:
-        return pin.neutral(self.model)
+        return u if self.model.nq == self.model.nv else pin.integrate(self.model, pin.neutral(self.model), u)
 
     @property
     def posture(self) -> dict[str, float]:

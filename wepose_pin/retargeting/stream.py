@@ -240,13 +240,13 @@ class CommandStream:
             raise WrongOption("hold-after", f"{hold_after:g}", needed)
         self.robot, self.dt, self.hold_after, self.stop_after = robot, 1.0 / rate_hz, hold_after, stop_after
         self._omega = 2.0 * np.pi * SMOOTHING_HZ
-        collision = CollisionModel(robot)
-        self._controller = QpController(robot, collision, self.dt)
+        self.collision = CollisionModel(robot)
+        self._controller = QpController(robot, self.collision, self.dt)
         self.state = JointState.at_rest(robot.rest)  # at the last command
         self.stopping = 0  # steps in which the robot braked, since none kept all limits and left a stop open
         no_target = HandTarget(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
         self._controller.step(self.state, (no_target,) * len(robot.arms))  # compiles before the robot moves
-        self._controller = QpController(robot, collision, self.dt)
+        self._controller = QpController(robot, self.collision, self.dt)
         self._number = 0
         self._time = np.nan
         self._observed: list[ArmObservation] = []
@@ -254,11 +254,6 @@ class CommandStream:
         self._trust = np.ones(len(robot.arms))
         self._references: list[_HandReference] | None = None
         self._approach_reason = self._stop_reason = self._end_reason = ""
-
-    @property
-    def checks_contact(self) -> bool:
-        """Whether the robot has shapes that can meet."""
-        return bool(self._controller.collision.pairs)
 
     @property
     def stopped(self) -> bool:

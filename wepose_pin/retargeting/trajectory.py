@@ -25,7 +25,7 @@ from ..body.urdf import read_urdf, resolve_meshes
 from ..errors import BadOption, WrongOption
 from ..recording import select_interval
 from ..tracking import TrackResult
-from ..writers import load_result
+from ..writers import load_result, select_pose
 from ..writers.motion import JointMotion
 from .collision import CollisionModel
 from .controller import ControllerParams, JointState, QpController, StepReport
@@ -179,7 +179,11 @@ def retarget(
     """
     check_arguments(retarget, locals())
     check_rate(rate_hz)
-    pose, body_table = _select_pose(pose, interval, phase)
+    motion = load_result(pose) if isinstance(pose, str | Path) else pose
+    if isinstance(motion, TrackResult):
+        table, motion = table or motion.model.table, select_pose(motion, interval, phase)
+    elif (selected := select_interval(motion.time, {}, interval, phase)) is not None:
+        motion = motion.cut(find_samples(motion.time, selected))
     stated = {"speed_scale": speed_scale, "limit_margin": limit_margin}
     margins = {name: value for name, value in stated.items() if value is not None}
     if not isinstance(robot, Robot):
@@ -190,19 +194,8 @@ def retarget(
         )
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
-    arm_targets = compute_arm_targets(pose, robot, table=table or body_table, scale=scale, smoothing_hz=smoothing_hz)
+    arm_targets = compute_arm_targets(motion, robot, table=table, scale=scale, smoothing_hz=smoothing_hz)
     return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, progress or (lambda _text, _fraction: None))
-
-
-def _select_pose(
-    pose: Pose | TrackResult | str | Path, interval: tuple[float, float] | None, phase: str | None
-) -> tuple[Pose, BodyTable | None]:
-    """Return an interval or a phase of a motion, and the table of its body where it has one."""
-    pose = load_result(pose) if isinstance(pose, str | Path) else pose
-    phases, table = (pose.phases, pose.model.table) if isinstance(pose, TrackResult) else ({}, None)
-    pose = pose.pose if isinstance(pose, TrackResult) else pose
-    selected = select_interval(pose.time, phases, interval, phase)
-    return pose if selected is None else pose.cut(find_samples(pose.time, selected)), table
 
 
 def _compute_trajectory(
