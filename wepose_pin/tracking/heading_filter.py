@@ -61,7 +61,7 @@ LEAST_LEARNED, LEARNED_VARIANCE_RATIO = 1e-4, 4.0
 MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accelerations
 # People stand off the start pose as the population does, or by a share of it where they take care: the share, and how
 # likely that is before anything is observed; assumptions.
-CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.2
+CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.05
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
