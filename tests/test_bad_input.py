@@ -120,7 +120,6 @@ SAYS = [
     ('forward = "+x"', 'forward = "-z"', "mount.forward = '-z' is parallel to up = '+z'"),
     ("accel =", 'orientation = ["qx", "qy", "qz", "qw"]\naccel =', "orientation stands beside gyro; a sensor has one"),
     ("\n[data]", "\nstart_pose = 'npose'\n[data]", "start_pose = 'npose' is not known; did you mean 'n_pose'?"),
-    ('file = "arm.csv"', 'file = "arm.csv"\ntruth = "t.parquet"', "session.toml: data.truth: no such file 't.parquet'"),
     (
         "[[0.5, 2.5]]",
         "[[0.5, 25.0]]",

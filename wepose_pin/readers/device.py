@@ -148,8 +148,9 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
 
 
 def _sort_known(signal: Signal) -> Signal:
-    order = np.argsort(signal.time, kind="stable")[: np.isfinite(signal.time).sum()]  # NaN are last
-    return Signal(signal.time[order], signal.values[order])
+    time, first = np.unique(signal.time, return_index=True)  # of rows with one time the first
+    known = np.isfinite(time)
+    return Signal(time[known], signal.values[first[known]])
 
 
 @contextmanager
