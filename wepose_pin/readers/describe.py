@@ -342,12 +342,11 @@ def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) ->
             time = read_columns(table, [name], place, "time")[:, 0]
             break
     else:
+        lines = () if arrays else read_first_lines(about.path)
         if dated := next(filter(None, (_measure_dated_rate(table[name]) for name in guess.times)), None):
             data["rate_hz"], name = dated
             about.facts.append(f"'{name}' holds dates; by the first and the last of them: {dated[0]:g} Hz")
-        elif stated := next(
-            filter(None, map(_STATED_RATE.search, () if arrays else read_first_lines(about.path))), None
-        ):
+        elif stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
             data["rate_hz"] = float(stated["rate"])
             about.facts.append(f"no column looks like time; the file says '{stated[0]}'")
         else:

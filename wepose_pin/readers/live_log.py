@@ -117,9 +117,9 @@ def read_live_log(path: Path) -> LiveRecording:
         header["phases"] = {**header["phases"], **markers.phases(*ends)}
         if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
             raise broke_off
-        resets = [int(event["tick"]) for event in events if event["kind"] == "reset"]
-        resets = [tick for tick in resets if tick < synchronizer.next_tick]
-        recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets))
+        ticks_of_resets = (int(event["tick"]) for event in events if event["kind"] == "reset")
+        resets = tuple(tick for tick in ticks_of_resets if tick < synchronizer.next_tick)
+        recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, resets)
     recording = replace(check_recording(recording), marks=tuple(markers.texts))
     if not is_complete:
         recording = replace(recording, diagnostics=(Diagnostic("file-incomplete", WARNING, path.name),))
@@ -132,18 +132,15 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     if rate_hz is not None:
         raise BadData(f"{path}: rate_hz = {rate_hz:g}: a live recording has times of its own; leave it out")
     recording = read_live_log(path).recording
-    sensors = {}
-    for name, sensor in recording.sensors.items():
-        if isinstance(sensor, ImuSensor):
-            signals = {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
-        else:
-            signals = {"orientation": sensor.quat_VS}
-        if sensor.gap is not None:
-            signals = {key: np.where(sensor.gap[:, None], np.nan, values) for key, values in signals.items()}
-        sensors[name] = DeviceSensor(recording.time, signals, name, sensor.stated_quat_LS)
-    kinds = sorted({"orientation" if "orientation" in each.signals else "raw" for each in sensors.values()})
+    kinds = sorted({"raw" if isinstance(each, ImuSensor) else "orientation" for each in recording.sensors.values()})
     if len(kinds) > 1 or use not in (None, *kinds):
         raise BadData(f"{path}: use = {use!r}: it holds {' and '.join(kinds)} data; track it as it is")
+    fields = {"gyro": "gyro_S", "accel": "accel_S"} if kinds == ["raw"] else {"orientation": "quat_VS"}
+    sensors = {}
+    for name, sensor in recording.sensors.items():
+        lost = False if sensor.gap is None else sensor.gap[:, None]
+        signals = {signal: np.where(lost, np.nan, getattr(sensor, each)) for signal, each in fields.items()}
+        sensors[name] = DeviceSensor(recording.time, signals, name, sensor.stated_quat_LS)
     diagnostics = recording.diagnostics
     if recording.resets:
         diagnostics += (Diagnostic("heading-resets-not-repeated", INFO, path.name, len(recording.resets)),)

@@ -309,9 +309,8 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
 
 # pyproject.toml registers them as those of other distributions.
 MVNX = Format("Xsens MVNX", lambda path, start: _has_suffix(path, ".mvnx") or "<mvnx" in start, read_mvnx, whole=True)
-SENSOR_LOGGER = Format(
-    "recording of Sensor Logger", lambda path, _: is_sensor_logger(path), read_sensor_logger, folder=True
-)
+PHONE = "recording of Sensor Logger"
+SENSOR_LOGGER = Format(PHONE, lambda path, _: is_sensor_logger(path), read_sensor_logger, folder=True)
 ROSBAG = Format("ROS bag", lambda path, _: is_rosbag(path), read_rosbag, whole=True, folder=True)
 XDF = Format("XDF", lambda path, _: _has_suffix(path, ".xdf", ".xdfz"), read_xdf, whole=True)
 STO = "OpenSim table of IMU orientations"

@@ -147,9 +147,8 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
     """Read the keys of a sensor; those that its table lacks are those of [data]."""
     keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))._replace(table=table)
     if "time" in table or "rate_hz" in table:  # one replaces the other
-        keys = keys._replace(
-            **{key: SensorKeys._field_defaults[key] for key in ("time", "rate_hz") if key not in table}
-        )
+        one = {key: SensorKeys._field_defaults[key] for key in ("time", "rate_hz") if key not in table}
+        keys = keys._replace(**one)
     if "mount" in table:
         axes = table.table("mount")
         axes.allow("up", "forward")
@@ -228,9 +227,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         else:
             keys[name], own_clocks[name], rows[name] = _take_sensor(name, each, devices[name], power_on_s, contents)
         if keys[name].aligned and ("mount" in each.table or "orientation" not in rows[name]):
-            raise BadSession(
-                f"{each.table.where}: aligned orientations are the segment's own: no mount, and no raw data"
-            )
+            raise BadSession(f"{each.table.where}: aligned orientations are the segment's own: no mount, no raw data")
     diagnostics = [own for content in contents.values() for own in getattr(content, "diagnostics", ())]
     packets = {id(each): (keys[name].path.name, each.packet) for name, each in own_clocks.items() if each.packet > 1}
     for file, size in packets.values():

@@ -79,9 +79,8 @@ def write_mot(path: Path, motion: TrackResult, names: str | None = None) -> list
         angles |= opensim
         missed = {body: angle for body, angle in residuals.items() if angle > MOST_MISSED}
         facts: dict[str, float | str] = {"variant": "opensim"}
-        diagnostics += [
-            Diagnostic("orientation-residual", WARNING, *each, MOST_MISSED, facts) for each in missed.items()
-        ]
+        for body, angle in missed.items():
+            diagnostics.append(Diagnostic("orientation-residual", WARNING, body, angle, MOST_MISSED, facts))
     if not angles and not motion.pose.joints:
         raise BadData(f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles")
     rows = pl.DataFrame({"time": motion.pose.time, **{k: np.degrees(v) for k, v in angles.items()}, **others})
@@ -123,9 +122,8 @@ def write_setups(sto: Path, motion: TrackResult, model: str, open_file: Callable
 
     `model`: the subject's. `open_file`: the path of a file → that to which it is written.
     """
-    placement, placer, ik = (
-        open_file(sto.with_name(f"{sto.stem}{ending}")) for ending in ("_placement.sto", "_placer.xml", "_ik.xml")
-    )
+    endings = ("_placement.sto", "_placer.xml", "_ik.xml")
+    placement, placer, ik = (open_file(sto.with_name(f"{sto.stem}{ending}")) for ending in endings)
     write_placement(placement, motion)
     placer.write_bytes(_fill("placer", model=model, stem=sto.stem))
     step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file

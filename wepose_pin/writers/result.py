@@ -52,9 +52,8 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     model = str(Path(recording.model).absolute()) if Path(recording.model).is_file() else recording.model
     head = {"name": recording.name, "model": model, "start_pose": recording.start_pose}
     data = {"file": "recording.parquet", "time": "time", "gyro_unit": "rad/s", "accel_unit": "m/s^2"}
-    spans = {
-        name: [[round(float(time), 3) for time in span] for span in each] for name, each in recording.phases.items()
-    }
+    phases = recording.phases.items()
+    spans = {name: [[round(float(time), 3) for time in span] for span in each] for name, each in phases}
     tables: dict[str, Mapping[str, Any]] = {
         "data": data | ({} if truth is None else {"truth": "truth.parquet"}),
         "phases": spans,
