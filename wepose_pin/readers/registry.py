@@ -186,6 +186,7 @@ def _read_imu(message: Any) -> list[float]:
 
 # XDF -----------------------------------------------------------------------------------------------------------------
 
+XDF_MAGIC = b"XDF:", b"\x1f\x8b"  # the latter of gzip
 _SIGNAL_WORDS = re.compile("accelerometer|gyroscope|accel|gyro|acc|gyr")
 
 
@@ -196,6 +197,9 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
     is found by their labels as in tables. pyxdf brings the clocks to one. Source: sccn/xdf, specification; pyxdf.
     """
     pyxdf = import_library("pyxdf", path, "an XDF")
+    with path.open("rb") as file:  # pyxdf leaves another file open
+        if not file.read(4).startswith(XDF_MAGIC):
+            raise BadData(f"{path}: is no XDF: it does not begin with 'XDF:'")
     logging.getLogger("pyxdf").setLevel(logging.CRITICAL)  # it reports what it mends
     with library_errors(path, "an XDF"):
         streams, _ = pyxdf.load_xdf(str(path))
