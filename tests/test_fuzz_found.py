@@ -74,7 +74,7 @@ STANDS = "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n" + 
 REFUSED: list[tuple[str, Callable[[], bytes], str]] = [
     (
         "subject",
-        lambda: change("subject", "matrix = [\n    [", f"matrix = [\n    [{MANY},"),
+        lambda: change("subject", "matrix = [[", f"matrix = [[{MANY},"),
         "covariance.matrix: rows of numbers are needed",
     ),
     ("subject", lambda: change("subject", "qw = 1.0", f"qw = {MANY}"), "mounts.torso.qw = 9999"),
