@@ -177,7 +177,7 @@ forward = "+x"
 [segments]
 torso = "torso"
 left_upper_arm = "left_upper_arm"
-left_forearm = { link = "left_forearm", up = "+z", forward = "+x" }
+left_forearm = { link = "left_forearm" }
 right_upper_arm = "right_upper_arm"
 right_forearm = "right_forearm"
 left_hand = "left_hand"

@@ -147,8 +147,8 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
     """Read the keys of a sensor; those that its table lacks are those of [data]."""
     keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))._replace(table=table)
     if "time" in table or "rate_hz" in table:  # one replaces the other
-        other = {key: SensorKeys._field_defaults[key] for key in ("time", "rate_hz") if key not in table}
-        keys = keys._replace(**other)
+        cleared = {key: SensorKeys._field_defaults[key] for key in ("time", "rate_hz") if key not in table}
+        keys = keys._replace(**cleared)
     if "mount" in table:
         axes = table.table("mount")
         axes.allow("up", "forward")
