@@ -85,6 +85,7 @@ def test_a_full_disk(
     captured = capsys.readouterr()
     assert code == 2, captured.err
     assert captured.err.count("\n") == 1
+    assert f"wepose: {command[-1]}: " in captured.err
     assert "too large" in captured.err.lower()
     assert [path.name for path in tmp_path.rglob("*")] == (["out"] if "OUT/" in words else [])
 

@@ -313,7 +313,7 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
         own = tempfile.TemporaryDirectory(prefix=prefix, dir=existing, ignore_cleanup_errors=True)
     except OSError as error:
         raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
-    with own as folder:
+    with own as folder, _name_output(out):
         partial = Path(folder) / "whole"  # with the user's usual permissions
         partial.mkdir()
         yield partial
@@ -350,8 +350,9 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
     check_output(file, force)
     partial = file.with_name(f".{file.name}.partial")
     try:
-        yield partial
-        partial.replace(file)
+        with _name_output(file):
+            yield partial
+            partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -362,3 +363,17 @@ def check_output(file: Path, force: bool = False) -> None:
         raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
     if file.is_dir() or not file.absolute().parent.is_dir():
         raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
+
+
+@contextmanager
+def _name_output(out: Path) -> Iterator[None]:
+    """Name `out` in an error of the system, which names no file when the disk is full, or one that is deleted."""
+    try:
+        yield
+    except Exception as error:
+        # One of polars has the system's text but no number; that of a copy names its source first.
+        number, text = getattr(error, "errno", None), getattr(error, "strerror", None) or str(error)
+        files = f"{getattr(error, 'filename', None) or '.partial'} {getattr(error, 'filename2', None)}"
+        if (number or "os error" in text) and ".partial" in files and not isinstance(error, WeposeError):
+            raise OSError(number, text, str(out)) from error
+        raise

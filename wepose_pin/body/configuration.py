@@ -86,8 +86,6 @@ class KinematicsSolver:
             for joint, R in R_AJ.items() if len(R_AJ) == 1 else ():
                 spherical.append((row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[joint]))
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
-        at = [m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4]
-        self._quaternions = np.reshape(at, (-1, 1)).astype(int) + np.arange(4)  # where they stand in q
         self._girdles = [
             (describe_girdle(model, name, self.segments), np.array([m.idx_qs[m.getJointId(j)] for j in girdle.joints]))
             for name, girdle in model.table.girdles.items()
@@ -102,20 +100,17 @@ class KinematicsSolver:
         """Solve for `q` (n, nq) of orientations (n, k, 4) xyzw; they continue the motion of the last call."""
         q = np.empty((len(quat_WL), len(self._neutral)))
         q[:] = self._neutral
+        last = np.zeros_like(self._neutral) if self._last is None else self._last
         if self._spherical:
-            _set_relative_rotations(quat_WL, *self._spherical, q)
+            _set_relative_rotations(quat_WL, *self._spherical, last, q)
         for relation in self._bent:
-            _bend(self._model.pin, q, quat_WL, relation, limits=self._limits)
+            _bend(self._model.pin, q, quat_WL, relation, last, limits=self._limits)
         if self._fit is not None:
             self._fit.run(q, quat_WL, self._last)
         for girdle, at in self._girdles:
             motion = np.empty((len(q), 7))
             follow_law(quat_WL, *girdle, motion)
             q[:, at] = motion[:, :3]
-        # Signs by which each quaternion lies on one side with that of the row before.
-        quats, last = q[:, self._quaternions], q[0] if self._last is None else self._last
-        jumps = np.einsum("nji,nji->nj", quats, np.concatenate([last[None, self._quaternions], quats[:-1]])) < 0.0
-        q[:, self._quaternions] = quats * np.where(np.logical_xor.accumulate(jumps), -1.0, 1.0)[..., None]
         self._last = q[-1].copy()
         return q
 
@@ -185,7 +180,9 @@ def _relate(model: BodyModel, segment: str, segments: Sequence[str]) -> _Relatio
     return segments.index(segment), -1 if above is None else segments.index(above), R_AL, R_AJ, places
 
 
-def _bend(m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation, *, limits: bool) -> None:
+def _bend(
+    m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation, last: np.ndarray, *, limits: bool
+) -> None:
     """Write the joints' values into `q` (n, nq): an equal share of the tilt in each place, the rest in the last."""
     row, above, R_AL, R_AJ, places = relation
     R_WA, up = quat_WL[:, above] if above >= 0 else _IDENTITY, R_AL.apply([0.0, 0.0, 1.0])
@@ -199,7 +196,8 @@ def _bend(m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation,
         at = m.idx_qs[joint]
         if m.nqs[joint] == 4:
             rotation = exp(share) if k < len(R_AJ) else left
-            q[:, at : at + 4] = multiply(multiply(R.inv().as_quat(), rotation), R.as_quat())
+            quat = multiply(multiply(R.inv().as_quat(), rotation), R.as_quat())
+            q[:, at : at + 4] = unwrap_signs(quat, last[at : at + 4])
         else:
             axis = R.apply(m.joints[joint].extract().axis)
             ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else (-np.inf, np.inf)
@@ -209,10 +207,11 @@ def _bend(m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation,
 
 
 @kernel
-def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ignore[no-untyped-def]
+def _set_relative_rotations(quat, rows, above, left, right, at, last, q):  # type: ignore[no-untyped-def]
     """Write R_JA R_AW R_WL R_LJ of each joint into `q` (n, nq), from `quat` (n, k, 4) xyzw.
 
-    `rows`, `above` are of L and A (-1: W) in `quat`, `left` R_JA and `right` R_LJ at zero, `at` its place in `q`.
+    `rows`, `above` are of L and A (-1: W) in `quat`, `left` R_JA and `right` R_LJ at zero, `at` its place in `q`. Each
+    lies on one side with that of the row before, which for the first is `last` (nq,).
     """
     for j in range(len(rows)):
         for i in range(len(quat)):
@@ -223,7 +222,9 @@ def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ign
             b = quat[i, rows[j]]
             x, y, z, w = product(x, y, z, w, b[0], b[1], b[2], b[3])
             x, y, z, w = product(x, y, z, w, right[j, 0], right[j, 1], right[j, 2], right[j, 3])
-            scale, k = 1.0 / np.sqrt(x * x + y * y + z * z + w * w), at[j]
+            scale, k, before = 1.0 / np.sqrt(x * x + y * y + z * z + w * w), at[j], last if i == 0 else q[i - 1]
+            if before[k] * x + before[k + 1] * y + before[k + 2] * z + before[k + 3] * w < 0.0:
+                scale = -scale
             q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3] = x * scale, y * scale, z * scale, w * scale
 
 
