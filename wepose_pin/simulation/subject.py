@@ -217,6 +217,11 @@ def simulate_activity(
     seconds : [s] duration of the activity
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
 
+    Returns
+    -------
+    Simulation
+        As of `simulate`.
+
     Raises
     ------
     BadOption, BadModel
@@ -312,7 +317,17 @@ def simulate_person(seed: int, measured_std: float = MEASURED_STD, body: str = D
     seed : the same seed gives the same person
     measured_std : [m] error of both measurements: by default that of a careful measurement between the joint centres
         themselves. Nobody can reach them: `PEOPLE_MEASURED_STD` is the error of 0.83 times the biacromial breadth
-    body : the body whose lengths are drawn: "upper_body" or "whole_body", else `BadModel`
+    body : the body whose lengths are drawn: "upper_body" or "whole_body"
+
+    Returns
+    -------
+    Person
+        Its `lengths` are those that `simulate` takes, its `prior` is a subject of that stature and sex.
+
+    Raises
+    ------
+    BadModel
+        No such body.
 
     Examples
     --------

@@ -19,7 +19,7 @@ from ..filters.phases import ACCEL_BIAS_STD
 from ..recording import Recording
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SegmentOrientations:
     """Orientation of each measured segment of a recording, or of a chunk of one."""
 
@@ -32,6 +32,9 @@ class SegmentOrientations:
     start: tuple[float, float]  # [s] from which headings and mounts are
     static_phase: tuple[float, float]  # [s] from which noise and bias are
     diagnostics: tuple[Diagnostic, ...]  # of the recording, its start pose and its mounts
+
+    def __repr__(self) -> str:
+        return f"SegmentOrientations({self.recording!r}, {self.options['method']})"
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
