@@ -156,6 +156,27 @@ def test_an_unknown_mount_beside_a_subject_that_has_none_for_it(half_minute: Rec
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize("rate_deg_s", [2.0, 10.0])
+def test_a_person_who_turns_in_the_start_pose_is_named(half_minute: Recording, rate_deg_s: float) -> None:
+    """The same rate about the vertical in all sensors: little of it makes the biases uncertain, much is refused."""
+    turning = {}
+    for segment, sensor in half_minute.sensors.items():
+        up = sensor.accel_S[half_minute.span(half_minute.phases["start"][0])].mean(axis=0)
+        turning[segment] = replace(sensor, gyro_S=sensor.gyro_S + np.deg2rad(rate_deg_s) * up / np.linalg.norm(up))
+    turned = replace(half_minute, sensors=turning)
+    if rate_deg_s > 5.0:
+        with pytest.raises(WeposeError, match=r"phases.start \(.* all sensors turn about the vertical"):
+            estimate_segments(turned)
+        return
+    still, segments = estimate_segments(half_minute), estimate_segments(turned)
+    (rotates,) = (each for each in segments.diagnostics if each.code == "start-pose-motion")
+    assert rotates.value == pytest.approx(np.deg2rad(rate_deg_s), rel=0.3)
+    assert "start-pose-motion" not in {each.code for each in still.diagnostics}
+    for segment, orientation in segments.orientation.items():
+        less = still.orientation[segment].noise.gyro_bias_cov
+        assert np.trace(orientation.noise.gyro_bias_cov - less) > 0.9 * np.deg2rad(rate_deg_s) ** 2
+
+
 def test_a_raised_arm_and_the_chest_are_less_certain_by_soft_tissue() -> None:
     """Of exact orientations; the further a segment is from the N-pose, the more a sensor turns on it."""
     time = np.arange(0.0, 12.0, 0.02)

@@ -245,7 +245,7 @@ def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult
     objects = [simulated, simulated.recording(), result, result.pose, result.subject, result.model, result.plot()]
     objects += [*simulated.recording().sensors.values(), wp.joint_angles(result), wp.joint_angles(result)["thorax"]]
     objects += [wp.evaluate(result, simulated.truth()), result.show(open=False)]
-    objects += [result.source]
+    objects += [result.source, wp.StaticTest()]
     for each in objects:
         assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
 

@@ -103,10 +103,14 @@ def test_a_dead_axis_is_refused_by_name_of_files_and_of_arrays(dead: str, made: 
         estimate_orientation(*pairs[BROKEN], RATE, static=(0.5, 4.5))
 
 
-def test_a_planar_motion_without_noise_is_measured() -> None:
-    """One axis never changes; the other two move."""
+@pytest.mark.parametrize("digit", [0.0, 0.02])
+def test_a_planar_motion_with_noise_below_its_digits_is_measured(digit: float) -> None:
+    """One axis never changes; the other two move, and between two digits they change like noise."""
     swing = np.sin(2.0 * np.arange(1000) / RATE).clip(0.0)[:, None]
     gyro, accel = swing * [0.5, 0.0, 0.3], swing * [2.0, 1.0, 0.0] + [0.0, 0.0, 9.81]
+    if digit:
+        noise = 0.1 * np.random.default_rng(0).standard_normal((1000, 3)) + [0.5, 0.0, 0.5]
+        gyro, accel = digit * np.round(gyro / digit + noise), digit * np.round(accel / digit + noise)
     assert len(Recording.from_arrays(RATE, torso=(gyro, accel))) == 1000
     estimate_orientation(gyro, accel, RATE, static=(1.6, 3.1))
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
@@ -174,6 +175,9 @@ def estimate_start_tilt(
 # below 3 deg/s and 3 deg. Above `MOVES` the mean pose is not the start pose; above `SWAYS` it is a warning.
 MOVES_DEG_S, MOVES_DEG = 20.0, 15.0
 SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
+# All sensors rotate about the vertical at one rate when the person rotates: a mean rate [rad/s] above `COMMON_RATE`
+# with a probability by chance below `COMMON_RATE_CHANCE`, in three sensors or more.
+COMMON_RATE, COMMON_RATE_CHANCE, FEWEST_SENSORS = float(np.deg2rad(0.5)), 1e-3, 3
 # Where a sensor turns faster than `SWAYS_DEG_S` over `MOTION_BLOCK_S`, it moves; a tremor averages out over so long.
 MOTION_BLOCK_S = 0.2
 LEAST_STATIC_S = 1.0  # of an interval with motion in it, that must be static
@@ -214,7 +218,7 @@ def find_reference_phases(
     if lying:
         _check_samples(recording, lying[0], "static")
         static = _find_static_part(recording, lying[0], "static", diagnostics)
-    noises: dict[str, SensorNoise] = {}
+    noises, up_S = dict[str, SensorNoise](), dict[str, np.ndarray]()
     for segment, sensor in recording.sensors.items():
         if not sensor.aligned:
             diagnostics += _check_motion(recording, segment, start, place)
@@ -225,6 +229,9 @@ def find_reference_phases(
                 noises[segment] = estimate_noise(part.gyro_S, part.accel_S, recording.rate_hz, worn)
             except WeposeError as error:
                 raise type(error)(f"{where}: sensors.{segment}: {error}") from error
+            force_S = part.accel_S.mean(axis=0)
+            up_S[segment] = force_S / np.linalg.norm(force_S)
+    diagnostics += _check_common_rotation(f"{where}: {'phases.static' if lying else place}", static, noises, up_S)
     return start, static, noises, diagnostics
 
 
@@ -309,6 +316,33 @@ def _check_motion(recording: Recording, segment: str, interval: tuple[float, flo
     facts: dict[str, float | str] = {"phase": place, "start": interval[0], "end": interval[1]}
     facts |= {"rotation": rotation, "rotation_limit": rotation_limit}
     return [Diagnostic("start-pose-motion", WARNING, segment, value, limit, facts)]
+
+
+def _check_common_rotation(
+    place: str, interval: tuple[float, float], noises: dict[str, SensorNoise], up_S: dict[str, np.ndarray]
+) -> list[Diagnostic]:
+    """Check that the person does not rotate in a phase: the mean rate there is taken for the gyroscopes' biases.
+
+    Biases about the vertical differ from sensor to sensor; a common rate is the person's (one-sample t-test). A slow
+    rotation gives a warning and is added to the biases' covariance in `noises`.
+    """
+    rates = np.array([noise.gyro_bias @ up_S[segment] for segment, noise in noises.items()])
+    if len(rates) < FEWEST_SENSORS:
+        return []
+    mean, error = float(rates.mean()), max(float(rates.std(ddof=1)), 1e-9) / np.sqrt(len(rates))
+    if abs(mean) < COMMON_RATE or 2.0 * stdtr(len(rates) - 1, -abs(mean) / error) > COMMON_RATE_CHANCE:
+        return []
+    turn_deg = abs(np.degrees(mean)) * (interval[1] - interval[0])
+    if turn_deg > MOVES_DEG:
+        raise BadPhase(
+            f"{place} ({format_span(interval)}): all sensors turn about the vertical at {np.degrees(mean):.1f} deg/s, "
+            f"by {turn_deg:.0f} deg in all: name seconds in which the person does not turn"
+        )
+    for segment, noise in noises.items():
+        turning = mean**2 * np.outer(up_S[segment], up_S[segment])
+        noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + turning)
+    facts: dict[str, float | str] = {"variant": "rotates", "rotation": float(np.deg2rad(turn_deg))}
+    return [Diagnostic("start-pose-motion", WARNING, value=abs(mean), limit=COMMON_RATE, facts=facts)]
 
 
 def find_static_window(recording: Recording) -> tuple[float, float]:

@@ -39,7 +39,7 @@ SIGNALS, SUMS = 7, 20
 _UPPER = np.triu_indices(3)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class StaticTest:
     """When a sensor counts as static: where all six conditions hold for the window that ends with the sample.
 

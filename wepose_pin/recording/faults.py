@@ -2,7 +2,7 @@
 
 A repeated value alone is no fault: a coarse sensor on a table repeats for minutes, and so do data without noise. It is
 one where the signal is noisy and repeats much longer than otherwise, or all along while another signal is noisy. So is
-a single axis that never changes while the sensor moves and the other two are noisy.
+a single axis that never changes while the sensor moves and the other two have noise of more than a digit.
 Files and live streams (`arrivals`) share what tells noise and saturation.
 """
 
@@ -129,8 +129,13 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         before = float(np.nextafter(time[0], -np.inf))  # the first sample is faulty, too
         for signals, signal in ((GYRO, gyro_S), (ACCEL, accel_S)):
             dead = np.flatnonzero((signal == signal[0]).all(axis=0))
-            if len(dead) == 1 and moves and _is_noisy(time, signal):
-                own.append(Fault(f"{signals} {'xyz'[dead[0]]}", before, float(time[-1]), (float(signal[0, dead[0]]),)))
+            if len(dead) == 1 and moves:
+                steps = np.abs(np.diff(signal, axis=0))
+                digit = steps.min(axis=0, where=steps > 0.0, initial=np.inf)
+                # Noise below a digit turns by single digits: then an axis that hardly moves stands, too.
+                if _is_noisy(time, signal * np.minimum(1.0, np.sqrt(ROUNDING_TURN / 1.5) / digit)):
+                    value = (float(signal[0, dead[0]]),)
+                    own.append(Fault(f"{signals} {'xyz'[dead[0]]}", before, float(time[-1]), value))
         of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
         for signals, columns, repeats, least_s in (
             (BOTH, (gyro_S, accel_S), of_gyro & of_accel, FROZEN_S),
