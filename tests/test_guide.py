@@ -24,7 +24,7 @@ from wepose_pin.readers.live_log import read_live_log
 CLASP = Path(__file__).parents[1] / "calibration" / "clasp.toml"
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
 MEASURED = {"shoulder_width": simulate_person(PERSON[0]).lengths["shoulder_width"]}
-PRESSED = {("sensors", "next"), ("start", "next"), ("quality", "accept")}
+PRESSED = {("sensors", "guide-next"), ("start", "guide-next"), ("quality", "guide-accept")}
 CLASP_S = 20.0  # of the test's protocol, for short recordings
 
 
@@ -100,7 +100,7 @@ class Session:
 def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path: Path) -> None:
     session = Session(tmp_path)
     moments = session.run()
-    assert session.clicks == ["next", "next", "accept"]
+    assert session.clicks == ["guide-next", "guide-next", "guide-accept"]
     assert session.guide.segments == session.person.worn
     assert [*dict.fromkeys(moment.step for moment in moments)] == [
         "sensors", "assignment", "start", "clasp", "quality",
@@ -134,7 +134,7 @@ def test_sensors_that_measure_orientations_are_shaken_and_calibrated_too(tmp_pat
     if orientations == "segment":
         session.guide.options.known.update(session.person.worn)
     session.run()
-    assert session.clicks == ["next", "next", "accept"]
+    assert session.clicks == ["guide-next", "guide-next", "guide-accept"]
     assert session.guide.segments == session.person.worn
     assert session.guide.accepted is not None
     subject = session.guide.accepted.subject
@@ -237,16 +237,16 @@ def test_a_length_gives_the_scale_and_one_that_cannot_be_is_refused(tmp_path: Pa
     before = session.run(lambda m: bool(m.view.quality))[-1].view
     assert before.quality == "poor"
     assert before.actions[-1].entry.endswith("[cm]")
-    guide.ask(Request("measure", "wide"))
+    guide.ask(Request("guide-measure", "wide"))
     assert guide.view() == before._replace(note="'wide' is no length in cm, such as 38.5.")
-    guide.ask(Request("measure", "-30"))
+    guide.ask(Request("guide-measure", "-30"))
     assert guide.view().quality == ""
     after = session.run(lambda m: bool(m.view.quality))[-1].view
     assert "-0.3" in after.note
     assert after._replace(note="") == before
     breadth = 100.0 * MEASURED["shoulder_width"]
-    name = next(action.entry for action in after.actions if action.name == "measure")
-    guide.ask(Request("measure", f"{breadth:.1f}".replace(".", ",")))
+    name = next(action.entry for action in after.actions if action.name == "guide-measure")
+    guide.ask(Request("guide-measure", f"{breadth:.1f}".replace(".", ",")))
     measured = session.run(lambda m: bool(m.view.quality))[-1].view
     assert name not in [action.entry for action in measured.actions]
     guide.close()
@@ -270,7 +270,7 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     session = Session(tmp_path, worn)
     moments = session.run(lambda m: m.step == "clasp")
     assert "assignment" not in {moment.step for moment in moments}
-    session.guide.ask(Request("accept"))  # is not offered
+    session.guide.ask(Request("guide-accept"))  # is not offered
     assert session.guide.step.name == "clasp"
     session.guide.ask(Request("start"))
     assert session.guide.step.name == "start"
@@ -279,6 +279,18 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     session.run(lambda m: m.step == "start")
     assert session.guide.segments == worn
     assert session.guide.attempt.log.path.name == "calibration-2.mcap"  # of other sensors
+    session.guide.close()
+
+
+def test_a_phase_may_be_named_next(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    file = tmp_path / "clasp.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace('"clasp"', '"next"'), encoding="utf-8")
+    options = QuickOptions(tmp_path, SensorSetup(), load_model(), str(file))
+    session.guide = Guide(session.source, options, make_steps(options.joined))
+    assert [*dict.fromkeys(moment.step for moment in session.run(lambda m: m.step == "next"))] == [
+        "sensors", "assignment", "start", "next",
+    ]  # fmt: skip
     session.guide.close()
 
 

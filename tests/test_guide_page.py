@@ -64,7 +64,7 @@ class Reader:
     def until(self, step: str = "", state: str = "", seconds: float = 300.0) -> dict[str, Any]:
         """Read and press until the page is at a step or in a state."""
         deadline = time.monotonic() + seconds
-        pressed = {("Sensors", "next"), ("Start pose", "next"), ("Result", "accept")}
+        pressed = {("Sensors", "guide-next"), ("Start pose", "guide-next"), ("Result", "guide-accept")}
         while time.monotonic() < deadline:
             said = self.read()
             if said and (said["step"] == step if step else said["state"] == state):
@@ -116,7 +116,7 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
             while json.loads(receiver.recv(65535))["state"] == "hold":  # the robot, until it has a pose
                 pass
             assert reader.steps == STEPS
-            assert reader.clicks == ["next", "next", "accept"]
+            assert reader.clicks == ["guide-next", "guide-next", "guide-accept"]
             moments = [time.monotonic()]
             for pressed in ("'true'", "null"):
                 browser.run("document.querySelector('[data-action=take]').click()")

@@ -119,6 +119,8 @@ def test_wrong_options_are_one_line(session: Path, tmp_path: Path, capsys: pytes
         (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
         (["--source", replay, "--record", str(file)], "there.mcap: exists; --force replaces it"),
         (["--source", replay, "--record", str(tmp_path / "no" / "a.mcap")], "a.mcap: cannot be written"),
+        # It is found before the person does anything.
+        (["--source", replay, "--guide", "-o", str(tmp_path / "o"), "--record", "no/a.mcap"], "a.mcap: cannot be"),
         (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file"),
         (["--source", replay, "--output", "udp:somewhere"], "--output udp: somewhere: a port or HOST:PORT is needed"),
         (["--source", replay, "--output", "osc:9000"], "--output osc:9000: 'osc' is none; there is: lsl, udp"),

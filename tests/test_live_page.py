@@ -93,6 +93,8 @@ def test_the_page_may_do_nothing_but_its_own(page: LivePage) -> None:
     code, headers, text = get(page.url)
     assert code == 200
     assert "<h1>&lt;b&gt;&amp; circles</h1>" in text
+    assert "default-src 'none'; script-src 'unsafe-inline'; " in text
+    assert "connect-src 'self'; base-uri 'none'; form-action 'none'\">" in text
     assert headers["X-Frame-Options"] == "DENY"
     assert headers["Cache-Control"] == "no-store"
     with pytest.raises(OSError):  # nothing listens on another address, loopback or not  # noqa: PT011

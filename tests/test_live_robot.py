@@ -449,3 +449,6 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
     assert run_command("live", "--source", f"replay:{torso}", "--no-page", "--robot", whole) == 2
     said = "arm's right arm follows right_upper_arm, right_forearm, which the sensors do not measure"
     assert said in capsys.readouterr().err
+    guide = ["--guide", "-o", tmp_path / "guided", "--protocol", "bow"]  # it is found before the guide begins
+    assert run_command("live", "--source", f"replay:{torso}", "--no-page", *guide, "--robot", whole) == 2
+    assert said in capsys.readouterr().err

@@ -128,6 +128,8 @@ def live(
     from ..live.setup import AssignedSource, build_subject_model, check_mounts, read_segments
     from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView
+    from ..retargeting.targets import check_person_arms
+    from ..writers.live_log import check_absent
 
     for option, value in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if value is not None and not guide:
@@ -160,6 +162,8 @@ def live(
                 raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
             outputs.append(load_plugin("outputs", name)(argument))
         folder = _make_guide_folder(out, force) if guide else Path()
+        if record is not None:
+            check_absent(record, force)
         title = worn.name if out is None else out.absolute().name
         served = _open_page(body, title, host, port, open) if page else None
         if served is not None:
@@ -168,6 +172,8 @@ def live(
             if guide:
                 task, known = protocol or choose_protocol(samples, worn, body), measured or {}
                 options = GuideOptions(folder, worn, body, task, method, known, stature, sex, subject, assigned)
+                if commands is not None:
+                    check_person_arms(commands.robot, options.joined.needs, table=body.table)
                 guided = run_guide(samples, options, outputs, should_stop)
                 if guided is None:
                     say("The guided session was ended before a calibration was accepted.")
@@ -227,6 +233,8 @@ def _print_end(session: SessionSummary, robot: RobotOutput | None, record: Path 
         title = f"{name}: {count} commands; with a pose {shares or 'none'}"
         print_table(title, ("arm", "hand off its target [mm]", "in 90 % under"), rows)
         print_diagnostics(robot.diagnostics)
+    if any(each.code == "file-incomplete" for each in session.diagnostics):
+        return  # which says what remains
     if session.record is not None:
         say(f"Recorded: {session.record}  (wepose track {session.record} -o DIR gives these poses again)")
     elif record is not None:

@@ -50,15 +50,16 @@ REMEDIES = {
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
 
-CONTINUE = Action("next", "Continue", "n")
-READY = Action("next", f"I am ready ({GET_READY_S:.0f} s to take the pose)", "n")
-FINISH = Action("next", "Finish", "n")
-ACCEPT = Action("accept", "Accept and track", "y")
+# A step has the name of its phase, and hardly one of these.
+CONTINUE = Action("guide-next", "Continue", "n")
+READY = Action("guide-next", f"I am ready ({GET_READY_S:.0f} s to take the pose)", "n")
+FINISH = Action("guide-next", "Finish", "n")
+ACCEPT = Action("guide-accept", "Accept and track", "y")
 # These repeat a step, whose name they have.
 AGAIN = Action("start", "Once more", "a")
 ANEW = Action("assignment", "Assign all anew", "a")
 RESTART = Action("start", "All again from the start pose", "a")
-MEASURE = Action("measure", "Use this length", "l")  # its entry names the length
+MEASURE = Action("guide-measure", "Use this length", "l")  # its entry names the length
 
 
 def run_guide(
