@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import IDEAL_PRESET, PEOPLE_PRESET, calibrate, load_model, population_subject, simulate, track
+from wepose_pin.body.soft_tissue import LEAST_POSE_SHARE, estimate_pose_share
 from wepose_pin.body.subject import Hinge
 from wepose_pin.simulation import simulate_person
 
@@ -57,3 +58,19 @@ def test_arms_show_how_exactly_a_person_stood() -> None:
         recording = simulate(person.lengths, seed=24000, imperfections=sizes, clasp_s=40.0, circles=0).recording()
         stds.append(calibrate(recording, measured=person.measured).subject.start_pose_offset["torso"][2])
     assert stds[0] < 0.75 * stds[1]
+
+
+@pytest.mark.parametrize(
+    ("offset", "share"),
+    [
+        ((0.0, 0.0, 0.01), LEAST_POSE_SHARE),
+        ((0.3, 0.3, 0.3), 1.0),  # not shown
+        ((0.3, 0.3, np.nan), 1.0),
+        ((0.15, 0.0, 0.01), 0.68),
+        ((1.5, 0.0, 0.01), 3.3),
+    ],
+)
+def test_the_share_of_a_start_pose_is_a_positive_number(offset: tuple[float, float, float], share: float) -> None:
+    offsets = {"left_upper_arm": np.array(offset)}
+    assert estimate_pose_share(offsets, load_model().table) == pytest.approx(share, rel=0.05)
+    assert estimate_pose_share({}, load_model().table) == 1.0

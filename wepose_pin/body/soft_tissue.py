@@ -1,4 +1,4 @@
-"""The size of a person's errors by the person's own data; soft tissue: its means, which are corrected, and the rest."""
+"""How large a person's own errors are: of soft tissue, whose means are corrected, and of the start pose."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ LEAST_TWIST_COSINE = 0.1
 # logarithm scatters. The logarithm of a person's size of soft tissue has a standard deviation among people, assumption.
 USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(5.3), 0.25
 SCATTER_LOG_STD = 0.5
-# Of simulated people, as a share of what the table states, geometric mean: the tilts of their arms in the start pose.
-# Its logarithm scatters, and, assumption, that of a segment against the person's own does.
+# Tilts of simulated people's arms in the start pose, as a share of what the table states, geometric mean. The logarithm
+# of a segment's share scatters about that of its person, which scatters as that of soft tissue; assumptions.
 USUAL_POSE_SHARE, POSE_LOG_STD = 0.78, 0.35
-SHOWN = 0.5  # times its standard deviation among people, to which the motion must show a tilt
+SHOWN = 0.5  # times its standard deviation among people: a tilt that is known better counts
 LEAST_POSE_SHARE = 0.25  # nobody stands more exactly
 
 

@@ -2,25 +2,28 @@
 
     minimise  ½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c),   no length below `MIN_LENGTH`
 
-with the prior c, Λ of `build_prior` and the weights w of its outer rounds.
+with the weights w of its outer rounds. The prior c, Λ holds all that is known beside the samples: population, start
+pose, mounts and measured lengths (`build_prior`), and accelerations of joints (`headings.add_couplings`).
 
 For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. Here L is
 the frame of its segment that equals W in the start pose (L' in `observations`). With a start pose that is ε off the
 stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
-    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
+    R(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε),    R_WL(t) = R exp(A (Rᵀ e_z − e_z))
 
-with ψ the heading, d its drift since the start, and A the rotation of a sensor on a foam, which gives as the direction
-of gravity in the segment changes. Skin lags behind a bone that twists: a segment above a hinge has turned about its
-long axis by g times the twist that its sensor shows. A segment's points may move, as the shoulders do by collarbones
-and shoulder blades while the arms are raised (`body.girdle`). d, A, g and the hinges are nuisance parameters: the
-covariance of lengths and mounts includes their effect.
+with ψ the heading, d its drift over the time τ since the start, and A the rotation of a sensor on a foam, which gives
+as the direction of gravity in the segment changes. Skin lags behind a bone that twists: a segment above a hinge has
+turned further than its sensor about its long axis, by g times the sine of the twist that the sensor shows against the
+segment above it. A segment's points may move, as the shoulders do by collarbones and shoulder blades while the arms are
+raised (`body.girdle`). d, A, g and the hinges are nuisance parameters: the covariance of lengths and mounts includes
+their effect.
 
 Each sample belongs to one condition of the protocol. A closure gives the gap, whitened by the covariance that errors of
-the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves leaves its
-plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual. A `Direction`
-gives the deviation of a segment from it, an `Axis` how far it rises while the segment bends. Each sample has the same
-residuals: three of its condition and one a hinge; those that do not apply are zero.
+the orientations and slipping palms give it, and of each hinge the sine of the angle by which the segment that it moves
+leaves its plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual. A
+`Direction` gives the deviation of a segment's long axis from it, an `Axis` how far the axis rises while the segment
+bends. Each sample has the same residuals: three of its condition and one for each hinge; those that do not apply are
+zero.
 """
 
 from __future__ import annotations
@@ -177,7 +180,7 @@ def _express_residuals(layout: Layout, condition: Condition) -> tuple[ca.Functio
 
 
 def _orient_segments(layout: Layout, x: ca.SX, data: ca.SX) -> dict[str, ca.SX]:
-    """Return `quat_WL` (4,) of each segment with a sensor: by foam, and the twists by g, as above."""
+    """Return `quat_WL` (4,) of each segment with a sensor, with foam and twist as above."""
     quat_WL, up = {}, ca.DM([0.0, 0.0, 1.0])
     for i, name in enumerate(layout.sensors):
         heading, drift = x[layout.heading[i]], x[layout.drift[i]]

@@ -189,7 +189,7 @@ def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, me
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
     """Return the solution without the mounts that gravity or the motion contradicts, its labels checked.
 
-    Alternatives are tried quickly. One takes the place of the problem where the limbs move as a person's with it.
+    Alternatives are tried quickly. The best one replaces the problem if the limbs move as a person's with it.
     """
     problem = problem.leave_out_mounts()
     problem.observe()  # raises where a phase is too short
@@ -212,7 +212,7 @@ def solve_plausible(problem: CalibrationProblem) -> Calibration:
 
 
 def list_mount_alternatives(stated: Calibration) -> list[Alternative]:
-    """Return the problem without mounts that the motion contradicts, where the quick solution gives a reason."""
+    """Return how to leave out mounts that the motion contradicts; none where the quick solution gives no reason."""
 
     def leave_out_contradicted(problem: CalibrationProblem) -> CalibrationProblem:
         free = solve_problem(problem.remove_mounts(problem.R_VS), quick=True)
@@ -223,7 +223,7 @@ def list_mount_alternatives(stated: Calibration) -> list[Alternative]:
 
 
 def list_label_alternatives(stated: Calibration) -> list[Alternative]:
-    """Return the problem with two sensors, or both sides, exchanged, where the limbs do not move as a person's.
+    """Return exchanges of two sensors, and of both sides; none where the limbs move as a person's.
 
     Joined hands close the chain for some exchanged sensors as well: left for right, or upper arm for forearm of a side,
     give the same gap. The solution's elbows then bend backward, or sideways, as a person's cannot. Any other exchange
