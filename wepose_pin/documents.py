@@ -371,9 +371,9 @@ def _name_output(out: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        # One of polars has the system's text but no number; that of a copy names its source first.
+        # Those of polars and SQLite have a text but no number; that of a copy names its source first.
         number, text = getattr(error, "errno", None), getattr(error, "strerror", None) or str(error)
         files = f"{getattr(error, 'filename', None) or '.partial'} {getattr(error, 'filename2', None)}"
-        if (number or "os error" in text) and ".partial" in files and not isinstance(error, WeposeError):
+        if (number or re.search("os error|disk", text)) and ".partial" in files and not isinstance(error, WeposeError):
             raise OSError(number, text, str(out)) from error
         raise

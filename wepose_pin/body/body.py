@@ -242,7 +242,7 @@ def _load_body(path: Path, sensors: Collection[str] = (), where: str = "") -> Bo
     if table is None and sensors:  # a mechanism of the links with sensors
         for name in sensors:
             if name not in tree.below:
-                raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name)}")
+                raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name, 100)}")
         links = sorted(sensors, key=lambda name: len(tree.path(name)))
         segments = {name: MECHANISM_SEGMENT._replace(link=name, rigid_without_sensor=True) for name in links}
         body = _build_body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(urdf)), str(urdf))

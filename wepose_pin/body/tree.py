@@ -111,7 +111,7 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
     places += [(f"points.{name}", point.link) for name, point in table.points.items()]
     for place, link in [*places, *(("root", link) for link in table.root)]:
         if link not in tree.below:
-            raise BadModel(f"{table.where}: {place}: no link '{link}'; {one_of(tree.below, link)}")
+            raise BadModel(f"{table.where}: {place}: no link '{link}'; {one_of(tree.below, link, 100)}")
     M_WM = np.eye(4)  # M: the root link
     M_WM[:3, :3] = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()
     origin = np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
