@@ -71,6 +71,6 @@ def test_arms_show_how_exactly_a_person_stood() -> None:
     ],
 )
 def test_the_share_of_a_start_pose_is_a_positive_number(offset: tuple[float, float, float], share: float) -> None:
-    offsets = {"left_upper_arm": np.array(offset)}
+    offsets = {"left_upper_arm": np.array(offset), "torso": np.array((0.0, 0.0, 0.01))}
     assert estimate_pose_share(offsets, load_model().table) == pytest.approx(share, rel=0.05)
     assert estimate_pose_share({}, load_model().table) == 1.0

@@ -39,13 +39,13 @@ def estimate_scatter(hinge_stds: Collection[float]) -> float:
 def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> float:
     """Estimate how far a person is off the start pose, as a share of what the table states of people.
 
-    It follows from the tilts that the motion shows, as those of arms by their hinges, by empirical Bayes. `offsets` is
-    `Subject.start_pose_offset`.
+    It follows by empirical Bayes from the tilts of segments at a hinge, such as arms, which the motion shows. Of others
+    a standard deviation may be small because the prior's is. `offsets` is `Subject.start_pose_offset`.
     """
-    squares = []
+    squares, limbs = [], {name for hinge in table.hinges.values() for name in (hinge.on, hinge.moves)}
     for name, (x, y, std) in offsets.items():
         var = np.square(table.segments[name].start_std[:2])
-        if std < SHOWN * np.sqrt(np.mean(var)):
+        if name in limbs and std < SHOWN * np.sqrt(np.mean(var)):
             squares.append((x**2 + y**2) / (np.square(table.segments[name].start_mean[:2]) + var).sum())
     if not squares or table.is_mechanism:
         return 1.0
