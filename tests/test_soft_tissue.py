@@ -20,6 +20,17 @@ def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
     assert personal.soft_tissue.mean_per_twist == pytest.approx(used)
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.13])
+def test_segments_that_hang_on_each_other_share_how_exactly_a_person_stood(offset: float) -> None:
+    """A segment is not scaled for itself and once more for the one that carries it."""
+    tilts, body = {"left_upper_arm": np.array((offset, 0.0, 0.01))}, load_model()
+    hinges = {"right_elbow": Hinge(np.array((0.0, 1.0, 0.0)), 0.05, 0.4)}
+    own = replace(population_subject(), hinges=hinges, start_pose_offset=tilts).shape(body).personal
+    for name in ("torso", "pelvis", "head"):
+        share = own[name].start_std[2] / body.table.segments[name].start_std[2]
+        assert share == pytest.approx(estimate_pose_share(tilts, body.table))
+
+
 @pytest.mark.parametrize("size", [0.0, 1.0])
 def test_a_hinge_shows_how_far_skin_lags_behind_a_twist(size: float) -> None:
     person = simulate_person(3)

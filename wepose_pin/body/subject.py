@@ -194,10 +194,11 @@ class Subject:
         pose_share = estimate_pose_share(self.start_pose_offset, body.table)
         for name, segment in segments.items():
             lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
-            start_var, carrier = segment.start_std[2] ** 2 - segment.start_mean[2] ** 2, body.parents.get(name)
+            size, carrier = 1.0 if name in shown else pose_share**2, body.parents.get(name)
+            start_var = size * (segment.start_std[2] ** 2 - segment.start_mean[2] ** 2)
             if carrier in personal:
                 start += personal[carrier].start_mean[2]
-                start_var += personal[carrier].start_std[2] ** 2 - segments[carrier].start_std[2] ** 2
+                start_var += personal[carrier].start_std[2] ** 2 - size * segments[carrier].start_std[2] ** 2
             start_var = max(start_var, 0.0)
             if name in shown:
                 usual_axis, hinge = np.array(hinges[shown[name]].axis), self.hinges[shown[name]]
@@ -207,8 +208,6 @@ class Subject:
                 plane_var = (scatter * HINGE_PLANE_STD) ** 2
                 weight = start_var / (start_var + plane_var)
                 start, start_var = float(weight * angle), weight * plane_var
-            else:
-                start_var *= pose_share**2
             personal[name] = segment._replace(
                 soft_tissue=make_personal(segment.soft_tissue, share, lag, scatter),
                 start_mean=(*segment.start_mean[:2], start),
