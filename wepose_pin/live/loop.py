@@ -120,7 +120,7 @@ class LiveLoop(Stage):
         try:
             self.loop(should_stop)
             self._end_message = "The session has ended."
-        except WeposeError as error:
+        except (WeposeError, OSError) as error:
             self._end_message = f"The session has ended: {error}"
             raise
         finally:
