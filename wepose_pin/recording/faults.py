@@ -110,9 +110,11 @@ def check_arrays(place: str, rate_hz: float, samples: Mapping[str, tuple[np.ndar
     if not any(may_have_faults(values) for arrays in floats.values() for values in arrays):
         return
     times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in floats.items()}
-    for name, faults in find_faults(times).items():
-        text = faults[0].describe(max(faults[0].first, 0.0))
-        raise BadData(f"{place}{name}{': ' * bool(name)}{text}: it does not measure there; leave these samples out")
+    for name, (fault, *_) in find_faults(times).items():
+        text = f"{place}{name}{': ' * bool(name)}{fault.describe(max(fault.first, 0.0))}"
+        whole = fault.first < 0.0 and fault.last >= times[name][0][-1]
+        remedy = "; leave this sensor out" if whole else " there; leave these samples out"
+        raise BadData(f"{text}: it does not measure{remedy}")
 
 
 def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list[Fault]]:
