@@ -259,8 +259,13 @@ def test_devices_that_were_switched_on_at_other_times_need_an_offset(tmp_path: P
         load_file(tmp_path, "a", data='use = "orientation"')
 
 
-def test_two_clocks_are_joined_at_the_times_of_the_rates(tmp_path: Path) -> None:
-    """A phone's force comes 3 ms later, and ten samples of it are lost."""
+def test_equal_stamps_are_spread_and_two_clocks_joined_at_the_times_of_the_rates(tmp_path: Path) -> None:
+    """A Shimmer stamps two samples alike. A phone's force comes 3 ms later, and ten samples of it are lost."""
+    file = df.shimmer(tmp_path / "a.csv")
+    lines = file.read_text().splitlines(keepends=True)
+    lines[60] = lines[59].partition(";")[0] + lines[60][lines[60].index(";") :]
+    file.write_text("".join(lines))
+    assert len(load_file(tmp_path, "a.csv")) == N
     phone = df.sensor_logger(tmp_path / "chest", late=0.003)
     true = np.column_stack([np.interp(TIME[1:], TIME + 0.003, axis) for axis in ACCEL.T])
     np.testing.assert_allclose(load_file(tmp_path, "chest").sensors["torso"].accel_S, true, atol=1e-5)

@@ -15,6 +15,7 @@ from ..body import load_table
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, one_of
 from ..libraries import library_errors
+from ..recording.clocks import spread_equal_times
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
 
@@ -148,9 +149,9 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
 
 
 def _sort_known(signal: Signal) -> Signal:
-    time, first = np.unique(signal.time, return_index=True)  # of rows with one time the first
-    known = np.isfinite(time)
-    return Signal(time[known], signal.values[first[known]])
+    known = np.flatnonzero(np.isfinite(signal.time))
+    order = known[np.argsort(signal.time[known], kind="stable")]
+    return Signal(spread_equal_times(signal.time[order]), signal.values[order])
 
 
 @contextmanager

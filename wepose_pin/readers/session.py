@@ -293,7 +293,8 @@ def _take_sensor(
         raise BadSession(f"{table.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
     sensor = device.sensors[labels[0]]
     offset_s = keys.offset_s - (power_on_s if device.since_power_on else 0.0)
-    clock = _once(contents, (path, id(sensor.time), offset_s), clocks.build_clock, sensor.time + offset_s, str(path))
+    key, time = (path, id(sensor.time), offset_s), sensor.time + offset_s
+    clock = _once(contents, key, clocks.build_clock, time, str(path), True)
     mount = sensor.mount if keys.mount is None else keys.mount
     aligned = device.aligned if keys.aligned is None else keys.aligned
     return keys._replace(mount=mount, aligned=aligned), clock, sensor.signals

@@ -31,6 +31,7 @@ REGULAR = 0.2
 # Rows come in packets when the median step is below `WITHIN_PACKET` of the mean, and `SAME_SIZE` of at least
 # `FEWEST_PACKETS` packets have one size.
 WITHIN_PACKET, SAME_SIZE, FEWEST_PACKETS = 0.5, 0.8, 5
+MOST_EQUAL = 10  # rows with one time that a device may write
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
 GOOD, BRIDGED, LONG = 0, 1, 2  # marks of samples
@@ -47,14 +48,16 @@ class Clock:
     packet: int = 1  # rows in a packet; their times were spread evenly
 
 
-def build_clock(time: np.ndarray, place: str) -> Clock:
+def build_clock(time: np.ndarray, place: str, is_device: bool = False) -> Clock:
     """Build the clock of a sensor from the times [s] of its rows; `place` begins an error's text.
 
+    `is_device`: equal times that make no packets are spread too; in a user's own table they are a mistake.
     `BadData`: time does not increase, is not in seconds, or jumps by more than the length of the recording.
     """
     if len(time) < 2:
         raise BadData(f"{place}: {len(time)} samples; a recording has at least 2")
     packet, time = _spread_packets(time)
+    time = spread_equal_times(time) if is_device else time
     check_time(place, time)
     steps = np.diff(time)
     step = float(np.median(steps))
@@ -108,6 +111,16 @@ def _spread_packets(time: np.ndarray) -> tuple[int, np.ndarray]:
         arrival[-1], steps_within[-1] = arrival[-2] + sizes[-1] * step, step
     packet = np.repeat(np.arange(len(ends)), sizes)
     return usual, arrival[packet] - steps_within[packet] * (ends[packet] - np.arange(n))
+
+
+def spread_equal_times(time: np.ndarray) -> np.ndarray:
+    """Spread equal times (n,) evenly up to the next one: of a clock coarser than the rate, or of uneven packets."""
+    new = np.flatnonzero(np.diff(time, prepend=-np.inf))
+    if len(new) < 2 or len(new) == len(time) or np.diff(new, append=len(time)).max() > MOST_EQUAL:
+        return time
+    step = (time[new[-1]] - time[new[0]]) / (new[-1] - new[0])
+    last = time[new[-1]] + step * (len(time) - new[-1])
+    return np.asarray(np.interp(np.arange(len(time)), [*new, len(time)], [*time[new], last]))
 
 
 def guess_time_unit(step: float) -> str | None:

@@ -33,7 +33,7 @@ def check_time(where: str, time: np.ndarray) -> None:
         k, before, after = back[0], *time[back[0] : back[0] + 2]
         fault, remedy = "goes back", "sort the rows by time, or cut the recording there"
         if before == after:
-            fault, remedy = "stands still", "delete one of the two rows"
+            fault, remedy = "stands still", "delete one of the two rows, or state rate_hz in place of the times"
         raise BadData(
             f"{where}: time {fault} in row {k + 2}: {format_time(after, 6)} s after {format_time(before, 6)} s; "
             f"it must grow in every row: {remedy}"
