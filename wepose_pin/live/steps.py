@@ -47,6 +47,7 @@ TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain"
 REMEDIES = {
     "scale-uncertain": "Measure what is asked for and enter it here.",
     "sensors-exchanged": "Go back to Segments, and shake each sensor that is asked for.",
+    "closure-open": "Keep the points together all the time.",
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
 
