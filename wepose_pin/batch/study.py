@@ -173,7 +173,7 @@ def run_item(item: Item, place: str, force: bool) -> Row:
         row = _run_unless_done(item, f"{place}/{item.name}", force)
     except Exception as error:
         message = str(error)
-        if not isinstance(error, WeposeError):  # a bug of ours: other items continue, and the table says where it is
+        if not isinstance(error, WeposeError | OSError):  # a bug of ours: the table says where it is
             last = traceback.extract_tb(error.__traceback__)[-1]
             message += f" ({Path(last.filename).name}:{last.lineno})"
         row = _fail(type(error).__name__, message)
