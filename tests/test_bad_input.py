@@ -135,6 +135,7 @@ SAYS = [
     ),
     ("arm.csv", "amr.csv", "amr.csv: no such file; did you mean 'arm.csv'?"),
     ('"gz"', '"gyr_z"', "session.toml: sensors.torso.gyro: no column 'gyr_z' in arm.csv; there is: time, gx"),
+    ('"gz"', '"ax"', "sensors.torso.accel: 'ax' of arm.csv is a column of sensors.torso.gyro too"),
     ('time = "time"', 'time = "Time"', "session.toml: data.time: no column 'Time' in arm.csv; did you mean 'time'?"),
     ('"m/s^2"', '"g"', "norm 96.2 m/s^2 in phases.start (0.5 to 2.5 s), where grav"),
     ('"rad/s"', '"deg/s"', 'data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong'),
@@ -182,7 +183,7 @@ CASES: list[tuple[Callable[[Files], object], str]] = [
     ),
     (
         lambda f: setattr(f, "session", f.session + f.session[f.session.index("[sensors") :].replace("torso", "head")),
-        "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso too",
+        "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso.gyro too",
     ),
     (lambda f: (f.folder / "arm.csv").mkdir(), "arm.csv: is a folder; a table is wanted here"),
     (

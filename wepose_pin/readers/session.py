@@ -169,9 +169,9 @@ def _check_columns(keys: Mapping[str, SensorKeys]) -> None:
     owners: dict[tuple[str, str], str] = {}
     for name, each in keys.items():
         for signal, column in ((signal, column) for signal, own in each.signals.items() for column in own):
-            if (owner := owners.setdefault((each.file, column), name)) != name:
-                place = each.table.at(signal)
-                raise BadSession(f"{place}: '{column}' of {each.file} is a column of sensors.{owner} too")
+            place = f"sensors.{name}.{signal}"
+            if (owner := owners.setdefault((each.file, column), place)) != place:
+                raise BadSession(f"{each.table.at(signal)}: '{column}' of {each.file} is a column of {owner} too")
 
 
 def format_keys(keys: Mapping[str, Any], checks: Mapping[str, str] = MappingProxyType({})) -> list[str]:
