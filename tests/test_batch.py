@@ -104,6 +104,7 @@ def test_what_has_changed_is_made_again_by_force_only(study: Path, change: str) 
     assert (table["status"][0], table["error"][0]) == ("changed", "ExistingOutput")
     assert f"has other {'input session' if change == 'recording' else change}; --force" in table["message"][0]
     assert table["samples"][0] > 0, "its figures stay in the table, as its folder does"
+    assert run(study, force=True, plan=PLAN + "interval = [60.0, 70.0]\n")["status"].to_list() == ["failed"]
     assert files(study / "out" / "items") == before
     assert run(study, force=True, plan=plan)["status"].to_list() == ["done"]
 

@@ -27,7 +27,7 @@ import numpy as np
 import polars as pl
 
 from ..commands.options import parse
-from ..documents import whole_file, whole_folder
+from ..documents import whole_file
 from ..errors import BadData, BadOption, ExistingOutput, LostWorker, WeposeError, reason
 from ..filters.base import count_processors
 from ..writers.provenance import code, file_hashes, list_named_files
@@ -324,11 +324,15 @@ def _create_folder(url: str) -> Iterator[Path]:
     To a URL its files are copied, with `DONE_FILE` last.
     """
     if not is_remote(url):
-        place = Path(url)
-        for left in (place, *place.parent.glob(f".{place.name}.partial-*")):  # also by a run that was stopped
+        place, prefix = Path(url), f".{Path(url).name}.partial-"
+        for left in place.parent.glob(f"{prefix}*"):  # by a run that was stopped
             shutil.rmtree(left, ignore_errors=True)
-        with whole_folder(place) as folder:
+        with tempfile.TemporaryDirectory(prefix=prefix, dir=place.parent, ignore_cleanup_errors=True) as temporary:
+            folder = Path(temporary) / "whole"  # with the user's usual permissions
+            folder.mkdir()
             yield folder
+            shutil.rmtree(place, ignore_errors=True)
+            folder.rename(place)
         return
     with tempfile.TemporaryDirectory(prefix="wepose-") as temporary:
         yield Path(temporary)

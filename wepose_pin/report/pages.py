@@ -7,7 +7,7 @@ import sys
 import tempfile
 import webbrowser
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,7 @@ def write_track_pages(
     angles = cache(lambda: compute_angles(tracked.pose))
 
     @cache
-    def make_view(fps: float = FRAMES_A_SECOND) -> str:
+    def make_view(fps: float) -> str:
         return pose_html(
             tracked.model, tracked.pose, phases=recording.phases, title=recording.name, angles=angles(), fps=fps
         )
@@ -57,7 +57,8 @@ def write_track_pages(
         reliance = describe_reliance(tracked, angles())
     except Exception as error:  # the result is complete without it
         reliance = f"How far the motion can be trusted cannot be said: {reason(error)}"
-    pages = {"view.html": make_view if view else None, "report.html": make_report if report else None}
+    whole = partial(make_view, FRAMES_A_SECOND) if view else None
+    pages = {"view.html": whole, "report.html": make_report if report else None}
     return reliance, write_pages(folder, pages)
 
 
