@@ -31,7 +31,7 @@ REGULAR = 0.2
 # Rows come in packets when the median step is below `WITHIN_PACKET` of the mean, and `SAME_SIZE` of at least
 # `FEWEST_PACKETS` packets have one size.
 WITHIN_PACKET, SAME_SIZE, FEWEST_PACKETS = 0.5, 0.8, 5
-MOST_EQUAL = 10  # rows with one time that a device may write
+SHORTEST_SHARE = 0.1  # of the usual step, that equal times which are spread are apart; less is a clock that stood still
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
 GOOD, BRIDGED, LONG = 0, 1, 2  # marks of samples
@@ -116,11 +116,13 @@ def _spread_packets(time: np.ndarray) -> tuple[int, np.ndarray]:
 def spread_equal_times(time: np.ndarray) -> np.ndarray:
     """Spread equal times (n,) evenly up to the next one: of a clock coarser than the rate, or of uneven packets."""
     new = np.flatnonzero(np.diff(time, prepend=-np.inf))
-    if len(new) < 2 or len(new) == len(time) or np.diff(new, append=len(time)).max() > MOST_EQUAL:
+    if len(new) < 2 or len(new) == len(time):
         return time
     step = (time[new[-1]] - time[new[0]]) / (new[-1] - new[0])
     last = time[new[-1]] + step * (len(time) - new[-1])
-    return np.asarray(np.interp(np.arange(len(time)), [*new, len(time)], [*time[new], last]))
+    spread = np.interp(np.arange(len(time)), [*new, len(time)], [*time[new], last])
+    steps = np.diff(spread)
+    return spread if steps.min() > SHORTEST_SHARE * np.median(steps) else time
 
 
 def guess_time_unit(step: float) -> str | None:
