@@ -258,7 +258,7 @@ def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("name", "content", "message"),
     [
         ("nothing.toml", None, "nothing.toml: no such file; a session file is wanted here"),
-        ("data.csv", b"time,gx\n", "data.csv: is no TOML by its name; a session file is wanted here"),
+        ("data.csv", b"time,gx\n", "data.csv: is not a TOML file by its name; a session is needed here"),
         ("bytes.toml", b"\xff\xfe\x00", "bytes.toml: not valid TOML"),
         ("empty.toml", b"", "empty.toml: data is missing; a table [data] is needed"),
     ],

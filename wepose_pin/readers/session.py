@@ -91,7 +91,7 @@ def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> To
     path = path / "session.toml" if path.is_dir() else path
     if path.suffix.lower() != ".toml" and path.is_file():
         written = f"which `wepose info {path.name} --write` writes"
-        raise BadSession(f"{path}: is no TOML by its name; a session file is wanted here, {written}")
+        raise BadSession(f"{path}: is not a TOML file by its name; a session is needed here, {written}")
     top = TomlTable(read_toml(path, "a session file") if values is None else values, str(path))
     top.allow(*SESSION_KEYS)
     return top
