@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import IDEAL_PRESET, PEOPLE_PRESET, calibrate, load_model, population_subject, simulate, track
-from wepose_pin.body.soft_tissue import LEAST_POSE_SHARE, estimate_pose_share
+from wepose_pin.body.soft_tissue import LEAST_POSE_SHARE, USUAL_POSE_SHARE, estimate_pose_share
 from wepose_pin.body.subject import Hinge
 from wepose_pin.simulation import simulate_person
 
@@ -28,7 +28,7 @@ def test_segments_that_hang_on_each_other_share_how_exactly_a_person_stood(offse
     own = replace(population_subject(), hinges=hinges, start_pose_offset=tilts).shape(body).personal
     for name in ("torso", "pelvis", "head"):
         share = own[name].start_std[2] / body.table.segments[name].start_std[2]
-        assert share == pytest.approx(estimate_pose_share(tilts, body.table))
+        assert share == pytest.approx(estimate_pose_share(tilts, body.table) / USUAL_POSE_SHARE)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])

@@ -17,7 +17,7 @@ from ..documents import Key, TomlTable, format_record, format_toml, read_record,
 from ..errors import BadData, BadModel, BadOption, BadSubject
 from .body import BodyModel
 from .girdle import PARAMETERS
-from .soft_tissue import estimate_pose_share, estimate_scatter, make_personal
+from .soft_tissue import USUAL_POSE_SHARE, estimate_pose_share, estimate_scatter, make_personal
 from .table import BodyTable, Segment, compute_population_lengths, load_table
 
 # A row of a covariance, other than lengths.
@@ -191,10 +191,11 @@ class Subject:
         share = sum(self.hinges[joint].twist_lag or 0.0 for joint in shown.values()) / usual
         share = min(max(share, 0.0), MOST_TISSUE_SHARE)
         scatter = estimate_scatter([hinge.std for hinge in self.hinges.values()])
-        pose_share = estimate_pose_share(self.start_pose_offset, body.table)
+        # The table states twists as people hold them, and tilts larger.
+        pose_size = min(estimate_pose_share(self.start_pose_offset, body.table) / USUAL_POSE_SHARE, 1.0)
         for name, segment in segments.items():
             lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
-            size, carrier = 1.0 if name in shown else pose_share**2, body.parents.get(name)
+            size, carrier = 1.0 if name in shown else pose_size**2, body.parents.get(name)
             start_var = size * (segment.start_std[2] ** 2 - segment.start_mean[2] ** 2)
             if carrier in personal:
                 start += personal[carrier].start_mean[2]
