@@ -19,6 +19,7 @@ from ..body.mounts import (
     find_mount_covariance,
     find_nominal_mount,
 )
+from ..body.soft_tissue import USUAL_POSE_SHARE
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
@@ -122,7 +123,7 @@ class CalibrationProblem:
         mean, information = np.zeros(3), np.zeros((3, 3))
         information[:2, :2], information[2, 2] = np.linalg.inv(start_cov[:2, :2]), HEADING_STD**-2
         if recording.start_pose == NEUTRAL_POSE:
-            mean[:2] = self.pose_share * np.array(own.start_mean[:2])
+            mean[:2] = min(self.pose_share / USUAL_POSE_SHARE, 1.0) * np.array(own.start_mean[:2])
         if mount is None:
             return mean, information
         heading = [0.0, 0.0, self.stated_headings[segment]]
