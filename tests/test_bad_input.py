@@ -185,7 +185,7 @@ CASES: list[tuple[Callable[[Files], object], str]] = [
         lambda f: setattr(f, "session", f.session + f.session[f.session.index("[sensors") :].replace("torso", "head")),
         "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso.gyro too",
     ),
-    (lambda f: (f.folder / "arm.csv").mkdir(), "arm.csv: is a folder; a table is wanted here"),
+    (lambda f: (f.folder / "arm.csv").mkdir(), "arm.csv: is a folder; a table is needed here"),
     (
         lambda f: (f.say("arm.csv", "arm.xlsx"), (f.folder / "arm.xlsx").write_bytes(b"PK")),
         "'.xlsx' is not a known format; there is: .csv, .tsv, .txt, .parquet",
@@ -257,7 +257,7 @@ def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("nothing.toml", None, "nothing.toml: no such file; a session file is wanted here"),
+        ("nothing.toml", None, "nothing.toml: no such file; a session file is needed here"),
         ("data.csv", b"time,gx\n", "data.csv: is not a TOML file by its name; a session is needed here"),
         ("bytes.toml", b"\xff\xfe\x00", "bytes.toml: not valid TOML"),
         ("empty.toml", b"", "empty.toml: data is missing; a table [data] is needed"),

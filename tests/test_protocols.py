@@ -89,7 +89,7 @@ def test_wrong_requests_are_one_line_that_names_them() -> None:
     fewer = replace(recording, sensors={k: v for k, v in recording.sensors.items() if k != "torso"})
     for match, asked in (
         ("protocol 'clap' is not known; did you mean 'clasp'", lambda: run(recording, "clap")),
-        ("mine.toml: no such file; a protocol is wanted here", lambda: run(recording, "mine.toml")),
+        ("mine.toml: no such file; a protocol is needed here", lambda: run(recording, "mine.toml")),
         (r"phases\.clasp is needed here", lambda: run(without(recording, "clasp"), "clasp")),
         (r"phases\.t_pose is needed here", lambda: run(recording, "t_pose")),
         (r"phases\.clasp has 0\.[67] s in which all sensors measure; at least 1\.25 s", lambda: run(short, "clasp")),

@@ -86,7 +86,7 @@ def test_measured_orientations_come_as_six_numbers() -> None:
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        ("torso", {}, "source 'torso' is none; there is: lsl:NAME"),
+        ("torso", {}, "source 'torso' is not known; there is: lsl:NAME"),
         ("rplay:x", {}, "did you mean 'replay:PATH'"),
         ("udp:", {}, "source 'udp:' is none"),
         ("replay:nothing", {}, "nothing"),

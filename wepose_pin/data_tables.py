@@ -165,7 +165,7 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
 def _is_parquet(path: Path) -> bool:
     """Return whether a file is Parquet, else it is a CSV; raise `MissingFile` where it is no table."""
     if path.is_dir():
-        raise MissingFile(f"{path}: is a folder; a table is wanted here, {', '.join(FORMATS)}")
+        raise MissingFile(f"{path}: is a folder; a table is needed here, {', '.join(FORMATS)}")
     if path.suffix.lower() not in FORMATS:
         raise MissingFile(f"{path}: '{path.suffix}' is not a known format; {one_of(FORMATS)}")
     if not path.is_file():

@@ -34,7 +34,7 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read: {failure.strerror}") from failure
     except (ValueError, RecursionError) as failure:
-        raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}; {what} is wanted here") from failure
+        raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}; {what} is needed here") from failure
 
 
 @dataclass(frozen=True)
@@ -336,7 +336,7 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
 def _check_folder(out: Path, force: bool, prefix: str) -> None:
     existing = next(path for path in (out.absolute(), *out.absolute().parents) if os.path.lexists(path))
     if not existing.is_dir():
-        raise ExistingOutput(f"{out}: cannot be made: {existing} is a file; a folder is wanted for the output")
+        raise ExistingOutput(f"{out}: cannot be made: {existing} is a file; a folder is needed for the output")
     if not force and out.is_dir() and any(not path.name.startswith(prefix) for path in out.iterdir()):
         raise ExistingOutput(f"{out}: exists and is not empty; --force replaces its files, -o names another folder")
 

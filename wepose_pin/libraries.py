@@ -51,7 +51,7 @@ def check_file(path: Path, kind: str) -> None:
     """Raise `MissingFile` where `path` is no regular file; its `kind` is such as "a C3D"."""
     if not path.is_file():
         state = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
-        raise MissingFile(f"{path}: {state}; {kind} is wanted here")
+        raise MissingFile(f"{path}: {state}; {kind} is needed here")
 
 
 def import_library(module: str, path: Path | str, kind: str) -> Any:

@@ -23,7 +23,7 @@ EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 def read_urdf(path: Path) -> Any:
     """The URDF as yourdfpy has it; each joint, shape and inertia states its origin (4, 4)."""
     if not path.is_file():
-        raise MissingFile(f"{path}: no such file; a URDF is wanted here")
+        raise MissingFile(f"{path}: no such file; a URDF is needed here")
     try:
         # yourdfpy's parser mends broken XML in silence, and reads what entities name, on disk too.
         ElementTree.parse(path)

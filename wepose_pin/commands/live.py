@@ -159,7 +159,7 @@ def live(
         for text in output or ():
             name, _, argument = text.partition(":")
             if name not in find_plugins("outputs"):
-                raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
+                raise BadOption(f"--output {text}: '{name}' is not known; {one_of(find_plugins('outputs'), name)}")
             outputs.append(load_plugin("outputs", name)(argument))
         folder = _make_guide_folder(out, force) if guide else Path()
         if record is not None:

@@ -240,7 +240,7 @@ def perform_motion(motion: Step, guide: Guide, asked_for: bool) -> StepRun:
 
 
 def find_longest(protocol: Protocol) -> Step:
-    """The motion of which more may be wanted."""
+    """The longest motion, of which the guide offers more."""
     return max((step for step in protocol.steps if step.phase != "start"), key=lambda step: step.seconds)
 
 

@@ -51,9 +51,7 @@ class Imperfections:
     clock_offset: float = 0.0  # [s] std of each sensor's clock against the stated time
     clock_drift_ppm: float = 0.0  # std of each clock's rate
     dropped: float = 0.0  # share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms)
-    accel_average: float = (
-        0.0  # share of the interval over which the accelerometer averages; at 1 it is half of it late
-    )
+    accel_average: float = 0.0  # share of the interval that the accelerometer averages; at 1 it is half of it late
 
     def __post_init__(self) -> None:
         check_fields(self, "")

@@ -51,7 +51,7 @@ _BLEND_S = 1.5  # between hanging arms and hands that are led, or arms held side
 _POSE_RAMP_S = 1.0  # in which the motion of a T-pose grows and dies away
 BOW = np.deg2rad(45.0)
 BOW_AXIS_STD = np.deg2rad(3.5)  # from the torso's y: such axes repeat within 2 to 5 deg (Luinge 2007, de Vries 2010)
-# How people hold the T-pose, each their own: assumptions, held to N- and T-poses in Robert-Lachaine 2017.
+# How people hold the T-pose, each their own: assumptions, checked against N- and T-poses in Robert-Lachaine 2017.
 T_POSE = {
     "elevation": Offset(-3.0, 5.0),
     "plane": Offset(10.0, 6.0),

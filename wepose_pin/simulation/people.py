@@ -31,8 +31,8 @@ class Offset(NamedTuple):
     std: float  # between people
 
 
-# The N-pose on request, each person's own: assumptions, held to the drop from acromion to wrist of ANSUR II (Gordon
-# 2014; a straight arm would be tilted by 10 to 12 deg), to N-pose errors in Bouvier 2015 and Bonfiglio 2024a.
+# The N-pose on request, each person's own: assumptions, checked against the drop from acromion to wrist of ANSUR II
+# (Gordon 2014; a straight arm would be tilted by 10 to 12 deg) and N-pose errors in Bouvier 2015 and Bonfiglio 2024a.
 _TRUNK_POSE_STD = np.deg2rad((3.0, 1.5, 5.0, 2.0, 5.0))  # pitch, roll of the torso; pitch, roll, heading of the head
 ARM_POSE = {
     "upper_arm_outwards": Offset(8.0, 4.0),
@@ -89,7 +89,7 @@ GAINS = {
     "pelvis_flexion": Offset(-0.08, 0.04),  # assumption
 }
 _TWIST_STD = 0.08  # of the two gains of twist, between people
-# rms across and about the segment's long axis [deg], correlation time [s]; assumptions, held to Lebel 2017.
+# rms across and about the segment's long axis [deg], correlation time [s]; assumptions, checked against Lebel 2017.
 RANDOM_DEG = {
     "torso": (1.5, 1.5, 3.0),
     "upper_arm": (2.0, 2.5, 2.0),

@@ -249,7 +249,7 @@ def read_joint_motion(folder: Path) -> JointMotion:
     """Read the trajectory that `wepose retarget` wrote; `MissingFile` or `BadData`: it is none, or is damaged."""
     file, summary_file, urdf = folder / TRAJECTORY, folder / "summary.json", folder / ROBOT_URDF
     if lost := [path.name for path in (file, summary_file, urdf) if not path.is_file()]:
-        raise MissingFile(f"{folder}: no {lost[0]} in it; a folder that `wepose retarget` wrote is wanted here")
+        raise MissingFile(f"{folder}: no {lost[0]} in it; a folder that `wepose retarget` wrote is needed here")
     with library_errors(summary_file, "the summary of a trajectory"):
         summary = json.loads(summary_file.read_text(encoding="utf-8"))
         joints, repetitions = tuple(map(str, summary["joints"])), summary.get(REPETITIONS) or {}

@@ -125,9 +125,8 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
 def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
     """Write a provenance as a file of its own into a folder."""
     text = json.dumps(provenance, indent=1, ensure_ascii=False)
-    (folder / "provenance.json").write_text(
-        f"{text}\n", encoding="utf-8", errors="backslashreplace"
-    )  # of a path not in UTF-8
+    # "backslashreplace": of a path that is not in UTF-8.
+    (folder / "provenance.json").write_text(f"{text}\n", encoding="utf-8", errors="backslashreplace")
 
 
 # Folders that hold an earlier result, or files of the user ---------------------------------------------------------

@@ -242,7 +242,7 @@ def load_result(folder: str | Path) -> TrackResult:
     check_arguments(load_result, locals())
     folder = Path(folder)
     if not (folder / POSE).is_file():
-        raise MissingFile(f"{folder}: no {POSE} in it; a folder that `wepose track` wrote is wanted here")
+        raise MissingFile(f"{folder}: no {POSE} in it; a folder that `wepose track` wrote is needed here")
     pose = parse_pose_table(read_table(folder / POSE), str(folder / POSE))
     if (folder / JOINTS).is_file():
         table, place = read_table(folder / JOINTS), str(folder / JOINTS)
