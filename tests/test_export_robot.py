@@ -180,7 +180,7 @@ def change_urdf(folder: Path, old: str, new: str) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda f: (f / "robot.urdf").unlink(), "no robot.urdf in it; a folder that `wepose retarget` wrote is wanted"),
+        (lambda f: (f / "robot.urdf").unlink(), "no robot.urdf in it; a folder that `wepose retarget` wrote is needed"),
         (lambda f: (f / "summary.json").write_text('{"robot": "arm"'), "summary.json: cannot be read as the summary"),
         (lambda f: change_summary(f, root={"x": 0.0}), "summary.json: cannot be read as the summary of a trajectory"),
         (lambda f: change_summary(f, joints=[*JOINTS, "gripper"]), "trajectory.parquet: no column 'gripper'"),
@@ -222,7 +222,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
         (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
         (["{slow}", "-o", "d", "--format", "lerobot"], "robot arm, 25 Hz, joints"),
         (["{other}", "-o", "d", "--format", "lerobot"], "50 Hz, joints flexion; a data set has one robot"),
-        (["-o", "{arm}/summary.json", "--format", "lerobot", "--force"], "summary.json is a file; a folder is wanted"),
+        (["-o", "{arm}/summary.json", "--format", "lerobot", "--force"], "summary.json is a file; a folder is needed"),
     ],
 )
 def test_a_wrong_export_of_a_robot_takes_one_line(

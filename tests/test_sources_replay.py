@@ -88,7 +88,7 @@ def test_measured_orientations_come_as_six_numbers() -> None:
     [
         ("torso", {}, "source 'torso' is not known; there is: lsl:NAME"),
         ("rplay:x", {}, "did you mean 'replay:PATH'"),
-        ("udp:", {}, "source 'udp:' is none"),
+        ("udp:", {}, "source 'udp:' is not known"),
         ("replay:nothing", {}, "nothing"),
         ("replay:x", {"speed": "fast"}, "speed: 'fast'; a positive number"),
         ("replay:x", {"speed": 0.0}, "speed: '0.0'"),
