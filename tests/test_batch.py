@@ -66,8 +66,16 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     (study / "data" / "bad").mkdir()
     (study / "data" / "bad" / "session.toml").write_text("[data]\nfile = 3\n")
     (study / "data" / "two" / "truth.parquet").unlink()
-    calls: list[tuple[str, float]] = []
-    outcome = run_batch(study / "plan.toml", str(study / "out"), workers=2, progress=lambda *now: calls.append(now))
+    calls: list[tuple[object, ...]] = []
+    environment = dict(os.environ)
+
+    def progress(*now: object) -> None:
+        calls.append(now)
+        with pytest.raises(ExistingOutput, match="out: another wepose batch runs there; wait until it ends"):
+            run(study)
+
+    outcome = run_batch(study / "plan.toml", str(study / "out"), workers=2, progress=progress)
+    assert dict(os.environ) == environment
     table = outcome.table
     assert table.equals(pl.read_parquet(study / "out" / "results.parquet"))
     assert table["item"].to_list() == ["data-bad", *NAMES]

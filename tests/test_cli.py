@@ -95,7 +95,11 @@ def test_demo_makes_all_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     subject, true = load_subject(tmp_path / "subject"), load_subject(tmp_path / "session")
     for name, length in true.lengths.items():
         assert abs(subject.lengths[name] - length) < 4 * subject.std(name)
-    assert (tmp_path / "result" / "view.html").is_file()
+    (tmp_path / "result" / "view.html").unlink()
+    (tmp_path / "result" / "view.html").mkdir()  # is in the way of the last command
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    assert run("demo", "-o", tmp_path, "--seed", 3, "--force") == 2
+    assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
 
 
 def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

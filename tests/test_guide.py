@@ -16,7 +16,8 @@ from sampling import find_free_port
 
 import wepose_pin as wp
 from wepose_pin import Calibration, Recording, calibrate, load_model, load_session, simulate_person
-from wepose_pin.live import Request, SensorSetup
+from wepose_pin.calibration import load_protocol
+from wepose_pin.live import Output, Request, SensorSetup, Status
 from wepose_pin.live.guide import Guide, GuideOptions
 from wepose_pin.live.steps import make_steps, measure_phase
 from wepose_pin.readers.live_log import read_live_log
@@ -292,6 +293,9 @@ def test_a_phase_may_be_named_next(tmp_path: Path) -> None:
         "sensors", "assignment", "start", "next",
     ]  # fmt: skip
     session.guide.close()
+    file.write_text(file.read_text(encoding="utf-8").replace('"next"', '"quality"'), encoding="utf-8")
+    with pytest.raises(wp.BadOption, match="phase 'quality' has the name of a step"):
+        make_steps(load_protocol(file))
 
 
 def test_more_motion_is_of_the_longest_part_of_a_joined_protocol_and_a_pose_is_repeated(tmp_path: Path) -> None:
@@ -306,6 +310,22 @@ def test_more_motion_is_of_the_longest_part_of_a_joined_protocol_and_a_pose_is_r
     guide.ask(Request("t_pose"))  # the pose is held anew
     assert set(guide.attempt.list_phases()) == {"start", "clasp"}
     guide.close()
+
+
+def test_what_ends_the_guide_is_shown(tmp_path: Path) -> None:
+    class Shown(Output):
+        def status(self, status: Status) -> None:
+            self.newest = status
+
+    class Broken(PersonSource):
+        def read(self, timeout_s: float) -> Any:  # noqa: ARG002
+            raise wp.BadSource("another unit")
+
+    session, shown = Session(tmp_path), Shown()
+    guide = Guide(Broken(session.person), session.guide.options, session.guide.steps, [shown])
+    with pytest.raises(wp.BadSource):
+        guide.run()
+    assert shown.newest[:2] == ("ended", "The session has ended: another unit")
 
 
 def test_a_full_disk_is_said_and_the_next_start_pose_begins_a_new_file(tmp_path: Path) -> None:

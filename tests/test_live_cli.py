@@ -114,7 +114,7 @@ def test_wrong_options_are_one_line(session: Path, tmp_path: Path, capsys: pytes
         (["--source", "udp:9000"], f"how the sensors are {unknown}"),
         (["--source", "udp:9000", "--stature", "1.8"], "--stature: goes with --guide"),
         (["--source", "udp:9000", "--guide", "--protocol", "free", "-o", str(tmp_path)], "free: has no motion"),
-        (["--source", "smoke:9"], "source 'smoke:9' is not known; there is: "),
+        (["--source", "mti:/dev/ttyUSB0=torso"], "[,accel_unit=g]; mti is a plug-in: pip install examples/mti"),
         (["--source", "replay:nowhere"], "nowhere: no such file"),
         (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
         (["--source", replay, "--record", str(file)], "there.mcap: exists; --force replaces it"),

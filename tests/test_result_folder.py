@@ -100,9 +100,3 @@ def test_pages_of_an_earlier_result_do_not_outlive_it(session: Path, tmp_path: P
     assert "<b>Good for</b> elbow flexion" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0
     assert np.isfinite(pl.read_parquet(tmp_path / "pose.parquet")["torso_qw"].to_numpy()).all()
-
-
-def test_a_page_that_cannot_be_replaced_leaves_the_result(session: Path, tmp_path: Path) -> None:
-    (tmp_path / "view.html").mkdir()
-    track_session(session, out=tmp_path, report=False, force=True)
-    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0

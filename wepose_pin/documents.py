@@ -6,9 +6,11 @@ import json
 import math
 import os
 import re
+import signal
 import tempfile
+import threading
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -296,12 +298,29 @@ written: list[Path] = []  # complete output folders, for the message of a comman
 
 
 @contextmanager
-def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
+def signals_delayed() -> Iterator[None]:
+    """Ctrl-C and SIGTERM take effect when the block has ended."""
+    came: list[int] = []
+    handlers: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():  # no other one is interrupted
+        for each in (signal.SIGINT, signal.SIGTERM):
+            handlers[each] = signal.signal(each, lambda number, _frame: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
+
+
+@contextmanager
+def whole_folder(out: Path, force: bool = False, earlier: Sequence[str] = ()) -> Iterator[Path]:
     """Create a new folder to write into; its files move to `out` when the block succeeds, and are deleted otherwise.
 
-    With `force`, files of the same name are replaced and all others stay. A killed process leaves at most a hidden
-    folder, ``.NAME.partial-…``, beside `out`, or in an existing `out`; it is never read and can be deleted. A new `out`
-    appears at once with all its files; in an existing one they appear one by one, each complete.
+    With `force`, files of the same name are replaced, other files that match the patterns `earlier` are deleted, and
+    the rest stays. A killed process leaves at most a hidden folder, ``.NAME.partial-…``, beside `out`, or in an
+    existing `out`; it is never read and can be deleted.
 
     Raise `ExistingOutput` where `out` is not empty and `force` is false, or it is no folder, or cannot be written.
     """
@@ -318,19 +337,20 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
         partial.mkdir()
         yield partial
         _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
-        if out.exists():
-            targets = {path: out / path.relative_to(partial) for path in sorted(partial.rglob("*"))}
-            for path, target in targets.items():
-                if target.exists() and target.is_dir() != path.is_dir():
-                    raise ExistingOutput(
-                        f"{target}: is in the way; nothing was written, move it or name another folder"
-                    )
-            for path, target in targets.items():
-                target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
-        else:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            partial.rename(out)
-        written.append(out)
+        targets = {path: out / path.relative_to(partial) for path in sorted(partial.rglob("*"))}
+        for path, target in targets.items():
+            if target.exists() and target.is_dir() != path.is_dir():
+                raise ExistingOutput(f"{target}: is in the way; nothing was written, move it or name another folder")
+        with signals_delayed():
+            if out.exists():
+                for path in {path for pattern in earlier for path in out.glob(pattern)} - {*targets.values()}:
+                    path.unlink()
+                for path, target in targets.items():
+                    target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
+            else:
+                out.parent.mkdir(parents=True, exist_ok=True)
+                partial.rename(out)
+            written.append(out)
 
 
 def _check_folder(out: Path, force: bool, prefix: str) -> None:

@@ -6,6 +6,7 @@ The steps of an item run in a new folder, which appears whole or not at all; wha
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import json
 import os
@@ -81,21 +82,20 @@ def run_batch(
     planned = [item for items in plan for item in items]
     rows: dict[str, Row] = {}
     count = workers or count_processors()
-    os.environ |= dict.fromkeys(_ONE_THREAD.split(), "1")
-    _create_study(out)
-    progress("starting workers", 0.0)
-    for items in plan:  # sessions need the calibrations
-        run = partial(run_item, place=place, force=force)
-        rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, count)
-        with contextlib.closing(rows_done) as done:
-            for item, row in done:
-                rows[item.name] = {"item": item.name, "session": item.session, "subject": item.subject} | row
-                failed = sum(each["status"] != DONE for each in rows.values())
-                progress(f"{len(rows)} of {len(planned)} items, {failed} failed", len(rows) / len(planned))
-    reused = sum(row.pop("reused", False) for row in rows.values())
-    ordered = [dict.fromkeys(_COMMON) | rows[item.name] for item in planned]
-    table = pl.DataFrame(ordered, schema_overrides=_COMMON, infer_schema_length=None)
-    _write_table(f"{out}/results.parquet", table)
+    with _create_study(out):
+        progress("starting workers", 0.0)
+        for items in plan:  # sessions need the calibrations
+            run = partial(run_item, place=place, force=force)
+            rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, count)
+            with contextlib.closing(rows_done) as done:
+                for item, row in done:
+                    rows[item.name] = {"item": item.name, "session": item.session, "subject": item.subject} | row
+                    failed = sum(each["status"] != DONE for each in rows.values())
+                    progress(f"{len(rows)} of {len(planned)} items, {failed} failed", len(rows) / len(planned))
+        reused = sum(row.pop("reused", False) for row in rows.values())
+        ordered = [dict.fromkeys(_COMMON) | rows[item.name] for item in planned]
+        table = pl.DataFrame(ordered, schema_overrides=_COMMON, infer_schema_length=None)
+        _write_table(f"{out}/results.parquet", table)
     return Study(table, reused)
 
 
@@ -111,7 +111,8 @@ def _run_here(run: RunItem, items: Sequence[Item], count: int) -> Generator[tupl
     while todo:
         pool = ProcessPoolExecutor(min(count, len(todo)), get_context("spawn"), _prepare_process)
         try:
-            futures = {pool.submit(run, item): item for item in todo}
+            with _limit_threads():  # of the processes, which begin here
+                futures = {pool.submit(run, item): item for item in todo}
             for future in as_completed(futures):
                 if future.exception() is None:
                     todo.remove(futures[future])
@@ -146,6 +147,19 @@ def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Gene
                 again = "the scheduler is gone; the same command goes on where it stopped"
                 raise LostWorker(f"{address}: {again}") from None
             yield futures[future], row
+
+
+@contextlib.contextmanager
+def _limit_threads() -> Iterator[None]:
+    """Processes that begin in the block have one thread each."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD.split()}
+    os.environ |= dict.fromkeys(before, "1")
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            del os.environ[name]
+            os.environ |= {} if value is None else {name: value}
 
 
 def _prepare_process() -> None:
@@ -287,9 +301,11 @@ def _write_table(url: str, table: pl.DataFrame) -> None:
         partial_file.write_bytes(content.getvalue())
 
 
-def _create_study(url: str) -> None:
-    """Make the folder of a study; `ExistingOutput`: it holds something else, or cannot be made."""
+@contextlib.contextmanager
+def _create_study(url: str) -> Iterator[None]:
+    """Make the folder of a study; `ExistingOutput`: it holds something else, cannot be made, or another batch runs."""
     if is_remote(url):
+        yield
         return
     place, items = Path(url), Path(url) / "items"
     if place.exists() and not items.is_dir() and not (place.is_dir() and not any(place.iterdir())):
@@ -298,6 +314,17 @@ def _create_study(url: str) -> None:
         items.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExistingOutput(f"{url}: cannot be written: {error.strerror}") from error
+    with contextlib.ExitStack() as stack:
+        lock = os.open(items, os.O_RDONLY)
+        stack.callback(os.close, lock)  # which the system does, too, when this process dies
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            message = f"{url}: another wepose batch runs there; wait until it ends, or name another folder"
+            raise ExistingOutput(message) from None
+        except OSError:
+            pass  # a file system without locks
+        yield
 
 
 def _fetch(url: str, into: Path, truth: bool = False) -> Path:

@@ -73,20 +73,19 @@ def calibrate(
     if prior is not None and (stature is not None or sex is not None):
         needed = "has the lengths of a person; --stature and --sex narrow those of the population"
         raise WrongOption("prior", prior, needed)
-    with progress_bar() as progress:
-        with result_folder(out, force) as folder:
-            progress("reading", 0.0)
-            recording = load_session(session, gaps=gaps)
-            body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
-            earlier = None if prior is None else load_subject(prior)
-            progress("calibrating", 1 / 3)
-            names = ("measured", "stature", "sex", "protocol", "method", "formulation")
-            chosen: dict[str, Any] = {name: options[name] for name in names}
-            calibration = room.calibrate(recording, prior=earlier, model=body, **chosen)
-            write_calibration(folder, calibration, collect_provenance("calibrate", options))
+    with progress_bar() as progress, result_folder(out, force, ("report.html",)) as folder:
+        progress("reading", 0.0)
+        recording = load_session(session, gaps=gaps)
+        body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
+        earlier = None if prior is None else load_subject(prior)
+        progress("calibrating", 1 / 3)
+        names = ("measured", "stature", "sex", "protocol", "method", "formulation")
+        chosen: dict[str, Any] = {name: options[name] for name in names}
+        calibration = room.calibrate(recording, prior=earlier, model=body, **chosen)
+        write_calibration(folder, calibration, collect_provenance("calibrate", options))
         progress("writing the report", 2 / 3)
         make = partial(report_room.render_calibration_report, calibration, recording) if report else None
-        failures = write_pages(out, {"report.html": make})
+        failures = write_pages(folder, {"report.html": make})
     quality = calibration.quality
     print_diagnostics([*quality.further, *failures])
     print_table(*report_room.tabulate_lengths(calibration))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -264,38 +265,38 @@ def angles(
 
     if main_angle is not None and repetitions is not None:
         raise BadOption(f"--main-angle {main_angle} finds repetitions, and --repetitions {repetitions} marks them")
-    with progress_bar() as progress:
-        with whole_folder(out, force) as folder:
-            # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
-            chosen: dict[str, Any] = {"sequence": shoulder, "cutoff_hz": low_pass_hz, "phase": repetitions}
-            chosen["main_angle"] = main_angle
-            movements: list[Movement] = []
-            for k, each in enumerate((result, *further), 1):
-                progress("reading", 0.7 * (k - 1) / (1 + len(further)))
-                tracked = load_result(each)
-                pose, name = select_pose(tracked, interval, phase), tracked.name
-                name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
-                try:
-                    movement = build.analyze_movement(name, pose, tracked.phases, **chosen)
-                except WrongOption as error:
-                    raise BadOption(f"{each}: {error}" if further else str(error)) from None
-                movements.append(movement)
-                chosen["sequence"] = movement.sequence or chosen["sequence"]
-                if repetitions is None and len(movement.repetitions.spans):
-                    chosen |= {"main_angle": movement.repetitions.source, "rising": movement.repetitions.rising}
-            progress("writing", 0.7)
-            tables = build.build_tables(movements)
-            for name, table in tables.items():
-                if len(table):
-                    rounded = table.with_columns(selectors.float().round(DECIMALS))
-                    with (folder / f"{name}.csv").open("wb") as file:  # polars takes only a path in UTF-8
-                        rounded.fill_nan(None).write_csv(file)
-            figures = report.draw_figures(movements)
-            for name, figure in figures.items():
-                (folder / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")
-            write_provenance(folder, collect_provenance("angles", options))
+    with progress_bar() as progress, whole_folder(out, force, ("angles.html",)) as folder:
+        # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
+        chosen: dict[str, Any] = {"sequence": shoulder, "cutoff_hz": low_pass_hz, "phase": repetitions}
+        chosen["main_angle"] = main_angle
+        movements: list[Movement] = []
+        for k, each in enumerate((result, *further), 1):
+            progress("reading", 0.7 * (k - 1) / (1 + len(further)))
+            tracked = load_result(each)
+            pose, name = select_pose(tracked, interval, phase), tracked.name
+            name = f"{name} ({k})" if name in [movement.name for movement in movements] else name
+            try:
+                movement = build.analyze_movement(name, pose, tracked.phases, **chosen)
+            except WrongOption as error:
+                raise BadOption(f"{each}: {error}" if further else str(error)) from None
+            movements.append(movement)
+            chosen["sequence"] = movement.sequence or chosen["sequence"]
+            if repetitions is None and len(movement.repetitions.spans):
+                chosen |= {"main_angle": movement.repetitions.source, "rising": movement.repetitions.rising}
+        progress("writing", 0.7)
+        tables = build.build_tables(movements)
+        for name, table in tables.items():
+            if len(table):
+                rounded = table.with_columns(selectors.float().round(DECIMALS))
+                with (folder / f"{name}.csv").open("wb") as file:  # polars takes only a path in UTF-8
+                    rounded.fill_nan(None).write_csv(file)
+        figures = report.draw_figures(movements)
+        for name, figure in figures.items():
+            (folder / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")
+        write_provenance(folder, collect_provenance("angles", options))
         progress("making the page", 0.9)
-        failures = write_pages(out, {"angles.html": lambda: report.render_angles_page(movements, tables, figures)})
+        page = partial(report.render_angles_page, movements, tables, figures)
+        failures = write_pages(folder, {"angles.html": page})
     lock = {each.place: each for movement in movements for each in diagnose_lock(movement.angles)}
     print_diagnostics([*lock.values(), *failures])
     print_table(*report.tabulate_sessions(tables["sessions"]))

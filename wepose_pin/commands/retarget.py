@@ -62,7 +62,7 @@ def retarget(
     from ..angles.repetitions import find_repetitions
     from ..documents import whole_folder
     from ..report import retargeting as report_room
-    from ..report.page import write_pages
+    from ..report.page import PAGES, write_pages
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
     from ..writers import load_result, select_pose
@@ -72,38 +72,37 @@ def retarget(
 
     names = ("robot", "arm", "task", "rate_hz", "scale", "smoothing_hz", "speed_scale", "limit_margin")
     chosen: dict[str, Any] = {name: options[name] for name in names}
-    with progress_bar() as progress:
-        with whole_folder(out, force) as folder:
-            progress("reading", 0.0)
-            tracked = load_result(result)
-            pose, body, name = select_pose(tracked, interval, phase), tracked.model, tracked.name
-            trajectory = retargeting.retarget(
-                pose,
-                table=body.table,
-                progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
-                **chosen,
-            )
-            progress("checking", 0.96)
-            check = retargeting.check_limits(retargeting.build_table(trajectory), trajectory.robot.map)
-            collisions = retargeting.find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
-            progress("writing", 0.98)
-            retargeting.write_trajectory(folder, trajectory)
-            sides = tuple(arm.side for arm in trajectory.robot.arms)
-            angles = joint_angles(pose)
-            own = {joint: each for joint, each in angles.joints.items() if joint.startswith(sides)}
-            repetitions = find_repetitions(replace(angles, joints=own))
-            summary = as_json(retargeting.summarize(trajectory, check, collisions))
-            summary |= {
-                "recording": name,
-                "recorded_phases": {name: list(map(list, spans)) for name, spans in tracked.phases.items()},
-                REPETITIONS: {
-                    "source": repetitions.source,
-                    "spans": repetitions.spans.tolist(),
-                    "reason": repetitions.reason,
-                },
-            }
-            text = json.dumps({**summary, "provenance": collect_provenance("retarget", options)}, indent=2)
-            (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    with progress_bar() as progress, whole_folder(out, force, PAGES) as folder:
+        progress("reading", 0.0)
+        tracked = load_result(result)
+        pose, body, name = select_pose(tracked, interval, phase), tracked.model, tracked.name
+        trajectory = retargeting.retarget(
+            pose,
+            table=body.table,
+            progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
+            **chosen,
+        )
+        progress("checking", 0.96)
+        check = retargeting.check_limits(retargeting.build_table(trajectory), trajectory.robot.map)
+        collisions = retargeting.find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
+        progress("writing", 0.98)
+        retargeting.write_trajectory(folder, trajectory)
+        sides = tuple(arm.side for arm in trajectory.robot.arms)
+        angles = joint_angles(pose)
+        own = {joint: each for joint, each in angles.joints.items() if joint.startswith(sides)}
+        repetitions = find_repetitions(replace(angles, joints=own))
+        summary = as_json(retargeting.summarize(trajectory, check, collisions))
+        summary |= {
+            "recording": name,
+            "recorded_phases": {name: list(map(list, spans)) for name, spans in tracked.phases.items()},
+            REPETITIONS: {
+                "source": repetitions.source,
+                "spans": repetitions.spans.tolist(),
+                "reason": repetitions.reason,
+            },
+        }
+        text = json.dumps({**summary, "provenance": collect_provenance("retarget", options)}, indent=2)
+        (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         progress("making the pages", 0.99)
         title = f"{name} on {trajectory.robot.map.name}"
 
@@ -116,7 +115,7 @@ def retarget(
             return report_room.render_retargeting_report(trajectory, summary, title=title, view=page)
 
         pages = {"view.html": make_view if view else None, "report.html": make_report if report else None}
-        failures = write_pages(out, pages)
+        failures = write_pages(folder, pages)
     print_diagnostics([*map(from_json, summary["diagnostics"]), *failures])
     for table in report_room.tabulate_hands(summary):
         print_table(*table)

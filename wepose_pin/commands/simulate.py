@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -144,19 +145,30 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
     seed
         Sample the person and the motion by this seed.
     """
+    from ..documents import signals_delayed, written
+
     session, subject, result = parts = [out / name for name in ("session", "subject", "result")]
     new = [folder for folder in (out, *parts) if not folder.exists()]
-    try:
-        person = simulate(out=session, seed=seed, force=force)
-        say("")
-        lengths = {name: round(metres, 4) for name, metres in person.measured.items()}
-        calibrate(session, measured=lengths, stature=round(person.stature, 2), sex=person.sex, out=subject, force=force)
-        say("")
-        track(session, subject=subject, out=result, force=force)
-        say("")
-        evaluate(result, session, phase="circles")
-    except BaseException:
-        for folder in new:  # all parts or none
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
+    replaced = [folder for folder in parts if force and folder.is_dir()]
+    with tempfile.TemporaryDirectory(prefix=".earlier-", dir=out if replaced else None) as earlier:
+        for folder in replaced:
+            shutil.copytree(folder, Path(earlier) / folder.name)
+        try:
+            person = simulate(out=session, seed=seed, force=force)
+            say("")
+            lengths = {name: round(metres, 4) for name, metres in person.measured.items()}
+            stature = round(person.stature, 2)
+            calibrate(session, measured=lengths, stature=stature, sex=person.sex, out=subject, force=force)
+            say("")
+            track(session, subject=subject, out=result, force=force)
+            say("")
+            evaluate(result, session, phase="circles")
+        except BaseException:
+            with signals_delayed():  # all parts or none
+                for folder in (*new, *replaced):
+                    shutil.rmtree(folder, ignore_errors=True)
+                for folder in replaced:
+                    (Path(earlier) / folder.name).rename(folder)
+                written.clear()
+            raise
     say(f"Open {result / 'view.html'} to see the motion.")

@@ -67,44 +67,44 @@ def track(
     from ..body.subject import load_subject, parse_subject
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
+    from ..report.page import PAGES
     from ..report.pages import write_track_pages
     from ..tracking import CHUNK_S, Tracker, TrackSummary, track_chunks
     from ..writers.provenance import collect_provenance, result_folder
     from ..writers.result import write_about, write_poses
 
     chosen = method or BEST
-    with progress_bar() as progress:
-        with result_folder(out, force) as folder:
-            progress("reading", 0.0)
-            person = None if subject is None else load_subject(subject)
-            if person is not None and not accept_failed:
-                person.check_quality()
-            if is_live_log(session):
-                log = read_live_log(session)
-                recording, causal = log.recording, causal or (method is None and person is None)
-                chosen = method or log.header["method"]
-                if person is None and log.header["subject"]:
-                    person = parse_subject(log.header["subject"], session)
-            else:
-                recording = load_session(session, gaps=gaps)
-            tracker = Tracker(person, model=model, method=chosen, causal=causal, open_loop=open_loop, limits=limits)
-            chunks = track_chunks(
-                tracker,
-                recording,
-                float("inf") if torques else CHUNK_S,
-                lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
-            )
-            summary, joint_torques = TrackSummary(recording), None
-            write_poses(folder, summary.accumulate(chunks), covariance)
-            if torques:
-                from ..angles.torques import pose_torques
+    with progress_bar() as progress, result_folder(out, force, PAGES) as folder:
+        progress("reading", 0.0)
+        person = None if subject is None else load_subject(subject)
+        if person is not None and not accept_failed:
+            person.check_quality()
+        if is_live_log(session):
+            log = read_live_log(session)
+            recording, causal = log.recording, causal or (method is None and person is None)
+            chosen = method or log.header["method"]
+            if person is None and log.header["subject"]:
+                person = parse_subject(log.header["subject"], session)
+        else:
+            recording = load_session(session, gaps=gaps)
+        tracker = Tracker(person, model=model, method=chosen, causal=causal, open_loop=open_loop, limits=limits)
+        chunks = track_chunks(
+            tracker,
+            recording,
+            float("inf") if torques else CHUNK_S,
+            lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
+        )
+        summary, joint_torques = TrackSummary(recording), None
+        write_poses(folder, summary.accumulate(chunks), covariance)
+        if torques:
+            from ..angles.torques import pose_torques
 
-                joint_torques = pose_torques(summary.last)
-            # Collected last, so that an input that is wrong is reported by its reader.
-            provenance = collect_provenance("track", options)
-            write_about(folder, summary.last, summary, joint_torques, provenance)
+            joint_torques = pose_torques(summary.last)
+        # Collected last, so that an input that is wrong is reported by its reader.
+        provenance = collect_provenance("track", options)
+        write_about(folder, summary.last, summary, joint_torques, provenance)
         progress("making the pages", 2 / 3)
-        reliance, failures = write_track_pages(out, summary, view=view, report=report)
+        reliance, failures = write_track_pages(folder, summary, view=view, report=report)
     content = summary.content
     print_diagnostics(from_json(each) for each in content["diagnostics"])
     lengths = content["subject"]["note"] or content["subject"]["name"]

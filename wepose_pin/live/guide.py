@@ -28,7 +28,7 @@ from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
 from ..documents import whole_file
-from ..errors import BadOption
+from ..errors import BadOption, WeposeError
 from ..filters import BEST
 from ..readers import load_session
 from ..recording import Recording, check_recording
@@ -86,10 +86,10 @@ class GuideOptions:
         )
         if isinstance(source, Path):
             stated = {"session": source, "measured": measured, "prior": self.subject, "method": self.method}
-            with result_folder(source.with_suffix(""), force=True) as folder:
+            with result_folder(source.with_suffix(""), force=True, pages=("report.html",)) as folder:
                 write_calibration(folder, calibration, collect_provenance("calibrate", stated | {"protocol": protocol}))
-            page = partial(render_calibration_report, calibration, recording)
-            write_pages(source.with_suffix(""), {"report.html": page})
+                page = partial(render_calibration_report, calibration, recording)
+                write_pages(folder, {"report.html": page})
         return calibration
 
 
@@ -162,12 +162,16 @@ class Guide(Stage):
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibration | None:
         """Lead the person until a calibration is accepted; None: the person, the source or `should_stop` ended it."""
+        end = Status("ended", "The session has ended.", 1.0)
         try:
             self.loop(should_stop)
+        except (WeposeError, OSError) as error:
+            end = end._replace(message=f"The session has ended: {error}")
+            raise
         finally:
             self.close()
-        if self.accepted is not None:
-            self.send_status()
+            for output in self.outputs:
+                output.status(end if self.accepted is None else self.build_status())
         return self.accepted
 
     def process(self, samples: list[Samples]) -> None:

@@ -321,15 +321,20 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
 
     Raises `KeyboardInterrupt` where `until` returns True meanwhile, and `WeposeError` where there is no such source.
     """
-    source.open()
-    while not source.connect(CONNECT_S):
-        message = f"Waiting for {source.describe_awaited()}."
+    try:
+        source.open()
+        while not source.connect(CONNECT_S):
+            message = f"Waiting for {source.describe_awaited()}."
+            for output in outputs:
+                output.status(Status("waiting", message, problems=dict(source.problems)))
+            if until():
+                raise KeyboardInterrupt
+            if QUIT in [request for output in outputs for request in output.take_requests()]:
+                return False
+    except (WeposeError, OSError) as error:
         for output in outputs:
-            output.status(Status("waiting", message, problems=dict(source.problems)))
-        if until():
-            raise KeyboardInterrupt
-        if QUIT in [request for output in outputs for request in output.take_requests()]:
-            return False
+            output.status(Status("ended", f"The session has ended: {error}", 1.0))
+        raise
     return True
 
 

@@ -87,6 +87,8 @@ def make_steps(protocol: Protocol) -> list[GuideStep]:
     motions = [step for step in protocol.steps if step.phase != "start"]
     if not motions:
         raise BadOption(f"--protocol {protocol.name}: has no motion that --guide could lead through; name another one")
+    for phase in {motion.phase for motion in motions} & {"sensors", "assignment", "quality"}:
+        raise BadOption(f"--protocol {protocol.name}: phase '{phase}' has the name of a step of --guide; rename it")
     return [
         GuideStep("sensors", "Sensors", find_sensors, before_attempt=True),
         GuideStep("assignment", "Segments", assign_segments, before_attempt=True),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
@@ -13,7 +12,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
 from ..diagnostics import INFO, WARNING, Diagnostic, lines
-from ..documents import whole_file
 from ..errors import reason
 from ..writers.result import versions
 from .words import Table
@@ -22,6 +20,7 @@ if TYPE_CHECKING:  # matplotlib loads only where a figure is drawn
     from .figures import ReportFigure
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it
+PAGES = ("view.html", "report.html")  # of a result
 MOST_FIGURES = 5  # of a page; tables have the rest
 
 
@@ -92,22 +91,18 @@ def inline(text: str) -> Markup:
 
 
 def write_pages(folder: Path, pages: Mapping[str, Callable[[], str] | None]) -> list[Diagnostic]:
-    """Write pages beside a result, each whole or not at all; return a diagnostic for each that cannot be made.
+    """Write pages into the new folder of a result; return a diagnostic for each that cannot be made.
 
-    `pages`: file name → what makes its text; None: it is not made. Pages of an earlier result are removed first.
+    `pages`: file name → what makes its text; None: it is not made.
     """
-    for name in pages:
-        with suppress(OSError):  # else writing it fails too, which is reported below
-            (folder / name).unlink(missing_ok=True)
     diagnostics = []
     for name, make in pages.items():
         if make is None:
             continue
         try:
-            text = make()
-            with whole_file(folder / name) as partial:
-                partial.write_text(text, encoding="utf-8")
+            (folder / name).write_text(make(), encoding="utf-8")
         except Exception as error:  # the result is complete without its pages
+            (folder / name).unlink(missing_ok=True)
             facts = {"reason": f"cannot be made: {reason(error)}"}
             diagnostics.append(Diagnostic("output-incomplete", WARNING, name, facts=facts))
     return diagnostics

@@ -22,7 +22,7 @@ from ..tracking import TrackResult, TrackSummary, summarize
 from ..tracking.summary import find_samples_after_start, finite_median, measure_reach
 from ..writers.provenance import CALL, collect_provenance, result_folder
 from ..writers.result import write_about, write_poses
-from .page import write_pages
+from .page import PAGES, write_pages
 from .viewer import FRAMES_A_SECOND, compute_angles, pose_html
 from .words import explain_no_covariance, listed, name_tips, plain
 
@@ -33,7 +33,7 @@ MOST_FRAMES_INSIDE = 3000  # of the view inside a report
 def write_track_pages(
     folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True
 ) -> tuple[str, list[Diagnostic]]:
-    """Write ``view.html`` and ``report.html`` beside a result, as `write_pages`; return what the motion is good for.
+    """Write ``view.html`` and ``report.html`` into a new result, as `write_pages`; return what the motion is good for.
 
     With it diagnostics of the pages that cannot be made.
     """
@@ -94,7 +94,7 @@ def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:
     """Write what `wepose track -o` writes, whole or not at all, and return the folder; as `TrackResult.save`."""
     out, source = Path(folder), result.source
-    with result_folder(out, force) as partial:
+    with result_folder(out, force, PAGES) as partial:
         if isinstance(source, Path):
             for file in source.iterdir():
                 if file.is_file():
@@ -105,7 +105,7 @@ def save_result(result: TrackResult, folder: str | Path, force: bool = False) ->
         inputs = {"session": result.recording.source, "subject": result.subject.name, "model": result.model.table.name}
         write_poses(partial, [result])
         write_about(partial, result, summary, provenance=collect_provenance(CALL, inputs | dict(result.options)))
-    write_track_pages(out, summary)
+        write_track_pages(partial, summary)
     return out
 
 

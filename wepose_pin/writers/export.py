@@ -16,7 +16,7 @@ from ..angles import angle_table, diagnose_lock, joint_angles
 from ..arguments import check_arguments
 from ..body.kinematics import build_pose_table
 from ..diagnostics import Diagnostic, notebook_html
-from ..documents import whole_file
+from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file, find_plugins, load_plugin
 from ..tracking import TrackResult
@@ -25,7 +25,6 @@ from .c3d import write_c3d
 from .joints import write_lerobot, write_mcap, write_rosbag, write_rrd
 from .motion import ROBOT_URDF, TRAJECTORY, HasJointMotion, check_rate, convert_person, read_joint_motion, resample
 from .opensim import write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
-from .provenance import data_folder
 from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
 
 Result = TrackResult | HasJointMotion | str | Path
@@ -196,7 +195,7 @@ def export(
         raise BadOption(f"--format {name}: a file of {len(results)} results; only lerobot takes several, as episodes")
     own = {option: value for option, value in own.items() if option not in MOTION}
     with contextlib.ExitStack() as files:
-        whole = data_folder(file, force, kind.earlier) if kind.earlier else whole_file(file, force)
+        whole = whole_folder(file, force, kind.earlier) if kind.earlier else whole_file(file, force)
         partial = files.enter_context(whole)
         motions = [] if kind.of == BODY else [_read_motion(each, name, interval, phase, rate_hz) for each in results]
         if name == "sto" and own:

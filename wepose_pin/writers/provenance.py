@@ -133,19 +133,8 @@ def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def data_folder(out: Path, force: bool, earlier: Sequence[str]) -> Iterator[Path]:
-    """`whole_folder` of a data set: with `force` files of an earlier one, by their patterns, go; all others stay."""
-    with whole_folder(out, force) as folder:
-        yield folder
-        written = {path.relative_to(folder) for path in folder.rglob("*")}
-    for path in [path for pattern in earlier for path in out.glob(pattern)]:
-        if path.relative_to(out) not in written:
-            path.unlink()
-
-
-@contextmanager
-def result_folder(out: Path, force: bool) -> Iterator[Path]:
-    """`data_folder` of a result; of an earlier result in `out` those files go that would be read with the new one.
+def result_folder(out: Path, force: bool, pages: Sequence[str] = ()) -> Iterator[Path]:
+    """`whole_folder` of a result; files of an earlier one are deleted if they are `pages` or read with a result.
 
     `ExistingOutput` is raised where a file of the user's would be read with the result, or an input be replaced.
     """
@@ -154,7 +143,8 @@ def result_folder(out: Path, force: bool) -> Iterator[Path]:
     if stale and not any((out / name).is_file() for name in INSIDE):
         why = "is of no earlier result, and would be read with the new one"
         raise ExistingOutput(f"{out / stale[0]}: {why}; rename it, or name another folder by -o")
-    with data_folder(out, force, [name for name in stale if (out / name).resolve() not in inputs]) as folder:
+    stale = [name for name in stale if (out / name).resolve() not in inputs]
+    with whole_folder(out, force, (*stale, *pages)) as folder:
         yield folder
         for name in sorted(file.name for file in folder.iterdir()):
             if (out / name).resolve() in inputs:
