@@ -25,7 +25,7 @@ from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
-from ..filters.sensors import average_start
+from ..filters import average_start
 from ..recording import Recording, find_runs, format_span
 from .equations import Gaussian, Layout
 from .headings import Couplings, estimate_couplings

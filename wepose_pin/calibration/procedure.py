@@ -38,9 +38,8 @@ from ..body.subject import Hinge, Subject, girdle_rows, mount_rows, population_s
 from ..body.table import check_segments
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
-from ..filters import BEST, SensorFilters, check_method
+from ..filters import BEST, SensorFilters, check_method, collect_orientations
 from ..filters.phases import find_reference_phases
-from ..filters.sensors import collect_orientations
 from ..recording import Recording
 from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
 from .headings import add_couplings, search_headings

@@ -1,35 +1,232 @@
-"""Orientation filters: one file each, one protocol (`base.OrientationFilter`).
+"""Orientation filters, one file each with one protocol (`base.OrientationFilter`), and the classes that run them.
 
-`sensors.METHODS` names them; `estimate_orientation` runs one on an array, from the static phase to the orientations.
+`METHODS` names them. `SensorFilters` runs one for each sensor, on whole recordings or sample by sample;
+`estimate_orientation` runs one on an array, from the static phase to the orientations.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from .. import rotations
 from ..arguments import check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
-from ..errors import BadData, BadOption, BadPhase, WeposeWarning
-from ..recording import ImuSensor, Recording
+from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
+from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.faults import check_arrays, find_gyro_range, find_largest
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
+from .amekf import AMEKF
 from .amekf import AmekfParams as AmekfParams
 from .base import Orientation as Orientation
+from .base import OrientationFilter, count_processors, make_orientation
 from .base import join_orientations as join_orientations
+from .complementary import GDC, NCF
 from .complementary import GdcParams as GdcParams
 from .complementary import NcfParams as NcfParams
-from .phases import TYPICAL, estimate_noise
-from .sensors import BEST as BEST
-from .sensors import METHODS as METHODS
-from .sensors import OFFLINE as OFFLINE
-from .sensors import STATIC_ONLY as STATIC_ONLY
-from .sensors import SensorFilters as SensorFilters
-from .sensors import check_method as check_method
+from .phases import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_noise, estimate_start_tilt
+from .smekf import PUBLISHED_SMEKF, SMEKF
 from .smekf import SmekfParams as SmekfParams
-from .static import StaticTest
+from .smoother import SMOOTHER
+from .static import USUAL_TEST, StaticTest, find_static, make_static_records
+
+METHODS: dict[str, OrientationFilter] = {
+    "amekf": AMEKF,
+    "smoother": SMOOTHER,
+    "smekf": SMEKF,
+    "smekf_published": PUBLISHED_SMEKF,
+    "ncf": NCF,
+    "gdc": GDC,
+}
+BEST = "amekf"  # of those that need no future (docs/validation.md)
+OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
+STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
+
+
+def check_method(method: str) -> str:
+    """Return the method, or raise `BadOption` where there is none of that name."""
+    if method not in METHODS:
+        raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
+    return method
+
+
+_Records = tuple[np.ndarray, ...]
+
+
+def _bind(
+    filter_: OrientationFilter, records: tuple[_Records, _Records], samples: Sequence[np.ndarray], out: Orientation
+) -> list[Callable[[], None]]:
+    """Return the calls of a filter's static test and of its run, which fill `out` from `samples` gyro_S, accel_S."""
+    filled = (out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical)[: 4 if filter_.has_covariance else 2]
+    return [
+        partial(find_static, *records[0], *samples, out.static),
+        partial(filter_.run, *records[1], *samples, out.static, *filled),
+    ]
+
+
+class SensorFilters:
+    """One filter for each sensor: `push` takes chunks, `step` a sample of each sensor, with bit-identical results.
+
+    A filter starts with the tilt of the start phase and runs forward from its first sample, and backward over earlier
+    samples, so that a recording may begin in motion. The smoother runs forward over all samples, from the end of the
+    backward run, and takes the whole recording as one chunk.
+
+    Parameters
+    ----------
+    noises : sensor → its noise, from its static phase; other sensors have no filter
+    method : a key of `METHODS`
+    params : the filter's own; None: its defaults, with the tilt of the start phase as it is known
+    static_test : when a sensor counts as static; "smekf_published" uses conditions (1) to (4) alone, the paper's
+    start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
+
+    Attributes
+    ----------
+    names : the k sensors
+    quat_VS, gyro_bias, static, attitude_cov, about_vertical : (k, …) after the last sample, as `Orientation`; the next
+        step overwrites them
+    """
+
+    def __init__(
+        self,
+        noises: Mapping[str, SensorNoise],
+        *,
+        method: str = BEST,
+        params: Any = None,
+        static_test: StaticTest | None = None,
+        start: slice | None = None,
+    ) -> None:
+        self._method, self._params, self._start = check_method(method), params, start
+        self._test = static_test or USUAL_TEST
+        if METHODS[method] is PUBLISHED_SMEKF:
+            self._test = replace(self._test, rate_stds=np.inf)
+        self.names, self._noises = tuple(noises), dict(noises)
+        self._records: dict[str, tuple[_Records, _Records]] = {}  # of the static test and of the filter
+        k = len(self.names)
+        self._now = make_orientation(k, TYPICAL, covariance=METHODS[method].has_covariance)
+        self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
+        self.quat_VS, self.gyro_bias, self.static, self.attitude_cov = self._now[:4]
+        self.about_vertical = self._now.about_vertical
+
+    def push(self, chunk: Recording) -> dict[str, Orientation]:
+        """Filter a chunk; `BadData`: the start phase has no gravity."""
+
+        def run(name: str) -> Orientation:
+            return self._filter(name, chunk.imus[name], chunk.rate_hz)
+
+        threads = min(count_processors(), len(self.names))
+        if threads > 1:  # compiled runs release the interpreter's lock
+            with ThreadPoolExecutor(threads) as pool:
+                orientations = list(pool.map(run, self.names))
+        else:
+            orientations = [run(name) for name in self.names]
+        for i, each in enumerate(orientations):
+            for name, values in each.sampled().items():
+                getattr(self._now, name)[i] = values[-1] if len(values) else getattr(self._now, name)[i]
+        return dict(zip(self.names, orientations, strict=True))
+
+    def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_VS` (k, 4).
+
+        A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
+        """
+        if np.shape(gyro_S) != self.gyro_bias.shape or np.shape(accel_S) != self.gyro_bias.shape:
+            raise BadData(f"gyro_S {np.shape(gyro_S)} and accel_S {np.shape(accel_S)}: {len(self.names)} rows of three")
+        self._gyro_S[:], self._accel_S[:] = gyro_S, accel_S
+        for call in self._calls:
+            call()
+        return self.quat_VS
+
+    @cached_property
+    def _calls(self) -> list[Callable[[], None]]:
+        """What a step calls, on arrays that stay: to prepare arguments takes longer than to filter a sample."""
+        calls: list[Callable[[], None]] = []
+        for i, name in enumerate(self.names):
+            gyro_S, accel_S, now = self._gyro_S[i : i + 1], self._accel_S[i : i + 1], self._now.take(slice(i, i + 1))
+            calls += _bind(METHODS[self._method], self._records[name], (gyro_S, accel_S), now)
+        return calls
+
+    def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
+        """Filter a chunk of one sensor."""
+        gyro_S, accel_S = (np.ascontiguousarray(each, dtype=float) for each in (sensor.gyro_S, sensor.accel_S))
+        if sensor.gap is not None:
+            # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
+            gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
+        begin, cov, filter_ = 0, None, METHODS[self._method]
+        out = make_orientation(len(gyro_S), self._noises[name], covariance=filter_.has_covariance)
+        if name not in self._records:
+            begin = self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range, out)
+        if self._method in OFFLINE and out.attitude_cov is not None:  # forward over all samples
+            begin, cov = 0, out.attitude_cov[:begin].copy()
+        rest = out.take(slice(begin, None))
+        for call in _bind(filter_, self._records[name], (gyro_S[begin:], accel_S[begin:]), rest):
+            call()
+        if cov is not None and out.attitude_cov is not None:
+            # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
+            out.attitude_cov[: len(cov)] = cov
+        return out
+
+    def _begin(
+        self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float, out: Orientation
+    ) -> int:
+        """Start the filter; fill `out` before its first sample by filtering backward, and return that sample."""
+        noise, filter_, params = self._noises[name], METHODS[self._method], self._params
+        phase = self._start or slice(0, self._test.samples(rate_hz))
+        quat_VS, tilt_std = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
+        if self._start is None:  # the sensor may move there
+            tilt_std = MOVING_TILT_STD
+        if params is None and filter_.params_type is not None:
+            params = filter_.params_type(**{"tilt_std": tilt_std} if filter_.has_covariance else {})
+        if gyro_range < getattr(params, "gyro_range", -np.inf):
+            params = replace(params, gyro_range=gyro_range)
+        static_records, first = make_static_records(noise, rate_hz, self._test), int(phase.start)
+        if first > 0:  # rates and bias change their sign backward in time; specific forces do not
+            backward = METHODS[BEST] if self._method in OFFLINE else filter_
+            mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
+            start = rotations.turned(quat_VS, _find_turn(gyro_S[first] - noise.gyro_bias, rate_hz))
+            static = tuple(record.copy() for record in static_records)
+            static[0]["bias"] *= -1.0
+            records = static, backward.make_records(mirrored, rate_hz, start, params)
+            run = make_orientation(first, mirrored, covariance=backward.has_covariance)
+            samples = [np.ascontiguousarray(each) for each in (-gyro_S[first:0:-1], accel_S[first - 1 :: -1])]
+            for call in _bind(backward, records, samples, run):
+                call()
+            for field, values in run.sampled().items():
+                getattr(out, field)[:first] = values[::-1]
+            out.gyro_bias[:first] *= -1.0
+            if out.about_vertical is not None:  # what the backward run has corrected is none of the forward run
+                out.about_vertical[:first] = 0.0
+            if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
+                quat_VS = rotations.turned(run.quat_VS[-1], -_find_turn(gyro_S[0] + run.gyro_bias[-1], rate_hz))
+                params = params if self._params else replace(params, tilt_std=MOVING_TILT_STD)
+        self._records[name] = static_records, filter_.make_records(noise, rate_hz, quat_VS, params)
+        return first
+
+
+def _find_turn(rate: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return the rotation [rad] over a sample; of lost ones zero."""
+    return np.where(np.isfinite(rate), rate, 0.0) / rate_hz
+
+
+def collect_orientations(recording: Recording, filtered: Mapping[str, Orientation]) -> dict[str, Rotation]:
+    """Return segment → n orientations R_VS of its sensor, `filtered` or measured; without mounts."""
+    return {
+        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else filtered[segment]).quat_VS)
+        for segment, sensor in recording.sensors.items()
+    }
+
+
+def average_start(
+    recording: Recording, R_VS: Mapping[str, Rotation], start: tuple[float, float]
+) -> dict[str, Rotation]:
+    """Return segment → mean orientation of its sensor in the start pose [s]."""
+    return {name: each[recording.find_measured(name, start)].mean() for name, each in R_VS.items()}
 
 
 def estimate_orientation(

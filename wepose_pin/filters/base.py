@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from functools import cache
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,12 +84,12 @@ def join_orientations(parts: Sequence[Orientation]) -> Orientation:
 
 def make_orientation(n: int, noise: SensorNoise, *, covariance: bool) -> Orientation:
     """Return arrays for n samples, to be filled."""
-    shapes = [(4,), (3,), *([(3, 3), (3,)] if covariance else [])]
-    ends = list(accumulate((n * math.prod(shape) for shape in shapes), initial=0))
-    memory = np.empty(ends[-1])  # one piece for all takes half the time of four
-    quat, bias, *rest = (memory[ends[k] : ends[k + 1]].reshape(n, *shape) for k, shape in enumerate(shapes))
-    cov, vertical = rest or (None, None)
-    return Orientation(quat, bias, np.empty(n, np.bool_), cov, noise, (), vertical)
+    cov, vertical = (np.empty((n, 3, 3)), np.empty((n, 3))) if covariance else (None, None)
+    return Orientation(np.empty((n, 4)), np.empty((n, 3)), np.empty(n, np.bool_), cov, noise, (), vertical)
+
+
+# One object for all records of a kind: a call of a compiled step takes 1 µs more to see that two are the same.
+_make_dtype = cache(lambda *fields: np.dtype(list(fields), align=True))
 
 
 def make_record(**values: Any) -> np.ndarray:
@@ -102,12 +100,6 @@ def make_record(**values: Any) -> np.ndarray:
     typed = {name: v if isinstance(v, np.generic | np.ndarray) else np.float64(v) for name, v in values.items()}
     dtype = _make_dtype(*((name, value.dtype, value.shape) for name, value in typed.items()))
     return np.array([tuple(typed.values())], dtype)
-
-
-@cache
-def _make_dtype(*fields: tuple[str, Any, tuple[int, ...]]) -> np.dtype:
-    # One object for all records of a kind: a call of a compiled step takes 1 µs more to see that two are the same.
-    return np.dtype(list(fields), align=True)
 
 
 class FilterParams:
@@ -132,11 +124,6 @@ class OrientationFilter(NamedTuple):
     run: Callable[..., None]
     params_type: type | None = None  # of its parameters, if it has any
     has_covariance: bool = True
-
-
-def as_rows(values: np.ndarray) -> np.ndarray:
-    """Return one sample (3,) or many (n, 3) as the contiguous rows that the compiled steps take."""
-    return np.ascontiguousarray(values, dtype=float).reshape(-1, 3)
 
 
 @inlined
@@ -181,6 +168,5 @@ def count_processors() -> int:
     """Return the number of processors that this process may use, or WEPOSE_THREADS where that is set."""
     if (stated := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
         return max(1, int(stated))
-    if hasattr(os, "sched_getaffinity"):  # Linux: a container or taskset may have fewer than the machine
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    # Linux: a container or taskset may have fewer than the machine.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
@@ -46,13 +46,11 @@ class SensorNoise:
     accel_cov: np.ndarray  # (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
     bias_step_cov: np.ndarray  # (3, 3) [rad²/s²] Σ_b, that of gyro's first differences, as in the authors' software
     gravity: float  # mean norm of accel [m/s²]: the gravity scale
-    # (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; None: white noise
-    gyro_half_second_cov: np.ndarray | None = None
+    # (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; zero: white noise
+    gyro_half_second_cov: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     def sway_density(self, rate_hz: float) -> float:
         """Compute the density [rad²/s] of sway on each axis; the mean rate over T s has 1/T of it as variance."""
-        if self.gyro_half_second_cov is None:
-            return 0.0
         white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
         total, bias = float(np.trace(self.gyro_half_second_cov)) / 3.0, float(np.trace(self.gyro_bias_cov)) / 3.0
         if total <= white:
@@ -89,9 +87,8 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     size = max(1, round(BLOCK_S * rate_hz))
     blocks, gyro_cov = n // size, _compute_cov(gyro_S)
     # Means of blocks average white noise out and keep sway; less than four show none.
-    half_second_cov = _compute_cov(average_blocks(gyro_S, size)) if blocks >= 4 else None
-    bias_cov = gyro_cov / n if half_second_cov is None or worn else half_second_cov / blocks
-    bias_cov = _apply_floor(bias_cov, BIAS_FLOOR)
+    half_second_cov = _compute_cov(average_blocks(gyro_S, size)) if blocks >= 4 else np.zeros((3, 3))
+    bias_cov = _apply_floor(gyro_cov / n if blocks < 4 or worn else half_second_cov / blocks, BIAS_FLOOR)
     if worn:  # what sways comes back: its mean is smaller than that of independent blocks
         half_second_cov = _estimate_sway_cov(gyro_S, size, half_second_cov)
         allowed = min(1.0, 2.0 / (SWAY_RATE * n / rate_hz) ** 2)
@@ -107,18 +104,18 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     )
 
 
-def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray | None) -> np.ndarray:
+def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray) -> np.ndarray:
     """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's means over blocks of `size` samples by sway.
 
     It is the `measured` one with `SWAY_RATE_STD` as a prior, or without it where the means vary like white noise. A
     phase of less than two seconds gives no estimate: half a sway looks like a steady rotation.
     """
-    if measured is None:
+    degrees = len(gyro_S) // size - 1
+    if degrees < 3:
         return SWAY_RATE_STD**2 * np.eye(3)
     white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / size
     excess = float(np.trace(measured)) / 3.0 - white
     prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
-    degrees = len(gyro_S) // size - 1
     return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
 
 
@@ -137,9 +134,7 @@ def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
 def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
     """Add the variance of the floor where the covariance falls below it along any direction."""
     floor = std**2 * np.eye(3)
-    (a, b, c), (_, d, e), (_, _, f) = (cov - floor).tolist()  # positive minors; LAPACK takes ten times as long
-    is_above = a > 0.0 and a * d > b * b and a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d) > 0.0
-    return cov if is_above else cov + floor
+    return cov if np.linalg.eigvalsh(cov - floor)[0] > 0.0 else cov + floor
 
 
 def estimate_start_tilt(

@@ -5,9 +5,9 @@ standard deviation grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz
 the attitude and not the covariance, so that static phases seem to measure the heading. Over two minutes of simulated
 motion with static phases the rms heading error is 0.57 deg as published and 0.10 deg here.
 
-The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s] in S. The paper's a is on the
-right of `quat_VS`, in S, as that of `attitude_cov`. Inside, a is on the left, in V, where it changes neither with the
-sensor's rotation nor with a correction of the attitude: Φ is the identity and P need not be rotated.
+The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s] in S. The paper's a is in S, on the
+right of `quat_VS`. Here it is in V, on the left, where neither the sensor's rotation nor a correction of the attitude
+changes it: Φ is the identity and P need not be rotated.
 
 Measurement model: gyro = ω + b + w_ω, accel/g = R_VSᵀ e_z + w_g. In a static phase ω = 0, so gyro measures b. The white
 noises w_ω, w_g and the bias's random walk have one variance on all axes, the mean of those of Σ_ω, Σ_g and Σ_b. A
@@ -195,10 +195,7 @@ def _make_records(
 SMEKF = base.OrientationFilter(_make_records, _run, SmekfParams)
 
 
-# As published, to the first order -------------------------------------------------------------------------------------
-#
-# The state is x = [a; b], a on the right of `quat_VS`, in S. Measurement model: gyro = ω + b + w_ω, accel/g = R_VSᵀ e_z
-# + w_g. Σ_ω and Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk.
+# As published, to first order, with a on the right of `quat_VS`, in S ------------------------------------------------
 
 START_VAR = 1e-3  # [rad²], [rad²/s²] P₀ of the authors' software
 

@@ -19,9 +19,8 @@ from typing import Annotated
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
-from ..arguments import NonNegative, Range, check_fields
+from ..arguments import NonNegative, PositiveOrInfinite, Range, check_fields
 from ..compilation import inlined, kernel
-from ..errors import BadOption
 from .base import make_record
 from .phases import BLOCK_S, SensorNoise
 
@@ -64,14 +63,10 @@ class StaticTest:
     beta: NonNegative = 2.0
     gamma1: NonNegative = 0.01
     gamma2: NonNegative = 0.01
-    rate_stds: float = 3.0
+    rate_stds: PositiveOrInfinite = 3.0
 
     def __post_init__(self) -> None:
         check_fields(self, "")
-        if not self.rate_stds >= 0.0:
-            raise BadOption(
-                f"rate_stds = {self.rate_stds}: a number from 0 on is needed, infinite for the paper's test"
-            )
 
     def samples(self, rate_hz: float) -> int:
         """Return the window's length in samples, at least 4: a covariance of three axes needs them."""
@@ -85,7 +80,7 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
     """Return the state with which `find_static` begins: records (1,), and arrays as long as the window."""
     n, newest = test.samples(rate_hz), max(1, round(NEWEST_S * rate_hz))
     dt, window_s = 1.0 / rate_hz, n / rate_hz
-    half_second_cov = np.zeros((3, 3)) if noise.gyro_half_second_cov is None else noise.gyro_half_second_cov
+    half_second_cov = noise.gyro_half_second_cov
     white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
     # (6): the inverse covariance of the change over the square of its bound, χ² of three axes as probable as of one
     squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
@@ -160,14 +155,12 @@ def _is_within(window, limit, part, share):  # type: ignore[no-untyped-def]
     xx = limit[0] - (window[first] - x * x * share)
     yy = limit[3] - (window[first + 3] - y * y * share)
     zz = limit[5] - (window[first + 5] - z * z * share)
-    if not (xx >= 0.0 and yy >= 0.0 and zz >= 0.0):
-        return False
     xy = limit[1] - (window[first + 1] - x * y * share)
     xz = limit[2] - (window[first + 2] - x * z * share)
     yz = limit[4] - (window[first + 4] - y * z * share)
-    if not (xx * yy - xy * xy >= 0.0 and xx * zz - xz * xz >= 0.0 and yy * zz - yz * yz >= 0.0):
-        return False
-    return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz) >= 0.0
+    of_two = xx * yy - xy * xy >= 0.0 and xx * zz - xz * xz >= 0.0 and yy * zz - yz * yz >= 0.0
+    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    return xx >= 0.0 and yy >= 0.0 and zz >= 0.0 and of_two and determinant >= 0.0
 
 
 @inlined

@@ -33,10 +33,9 @@ from ..body.table import check_segments
 from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..errors import BadOption, BadPhase, BadSession
-from ..filters import BEST, OFFLINE, Orientation, SensorFilters, check_method
+from ..filters import BEST, OFFLINE, Orientation, SensorFilters, average_start, check_method, collect_orientations
 from ..filters.base import HOLD_S, LOST_RATE_STD
 from ..filters.phases import BEGINNING_S, find_reference_phases
-from ..filters.sensors import average_start, collect_orientations
 from ..filters.static import StaticTest
 from ..recording import ImuSensor, Recording, Sensor, join_recordings
 from ..recording.arrivals import unpack_orientations
