@@ -39,7 +39,7 @@ def test_a_mount_tilted_from_its_stated_axes_is_found_by_gravity(
         off = Rotation.from_quat(true).inv() * Rotation.from_quat(segments.quat_LS[name])
         # What is left is the accelerometer's bias: 3 mg on each axis.
         assert np.degrees(off.magnitude()) < 0.8
-        stated = Rotation.from_quat(true).inv() * Rotation.from_quat(compute_mount(*simulation.stated_mount[name]))
+        stated = Rotation.from_quat(true).inv() * Rotation.from_quat(compute_mount(*simulation.stated_mount))
         assert np.degrees(stated.magnitude()) > 1.5
         true_WL = Rotation.from_quat(simulation.quat_WL[name][: len(half_minute)])
         error = Rotation.from_quat(segments.quat_WL[name]) * true_WL.inv()

@@ -34,14 +34,14 @@ def people() -> Simulation:
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"palm_slip": -0.001}, r"palm_slip -0\.001"),
+        ({"palm_slip": -0.001}, r"palm_slip = -0\.001"),
         ({"mount": "some"}, "mount = 'some'"),
         ({"bits": 16}, "bits 16 need a finite"),
         ({"gyro_range_deg_s": 0.0}, "gyro_range_deg_s"),
-        ({"dropped": 0.5}, r"dropped 0\.5"),
+        ({"dropped": 0.5}, r"dropped = 0\.5"),
         ({"sway": np.nan}, "sway = nan"),
-        ({"girdle": -1.0}, "girdle -1"),
-        ({"sensor_place": 1.5}, r"sensor_place 1\.5"),
+        ({"girdle": -1.0}, "girdle = -1"),
+        ({"sensor_place": 1.5}, r"sensor_place = 1\.5"),
     ],
 )
 def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:

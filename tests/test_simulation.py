@@ -112,7 +112,7 @@ def test_wrong_input_is_named() -> None:
     for lengths, options, said in (
         ({k: SUBJECT[k] for k in LENGTHS if k != "left_hand"}, {}, "left_hand"),
         ({**SUBJECT, "trunk": -0.5}, {}, r"trunk.*-0\.5"),
-        (SUBJECT, {"clasp_s": 1.0}, r"clasp_s 1\.0"),
+        (SUBJECT, {"clasp_s": 1.0}, r"clasp_s = 1\.0"),
         ({**SUBJECT, **short}, {}, "does not reach"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -114,9 +114,7 @@ def simulated(
         circles=1,
         imperfections=replace({"ideal": IDEAL_PRESET, "mild": MILD_PRESET}[preset], mount=mount),
     )
-    signals = {
-        name: Signals(gyro, made.accel_S[name], mount=made.stated_mount[name]) for name, gyro in made.gyro_S.items()
-    }
+    signals = {name: Signals(gyro, made.accel_S[name], mount=made.stated_mount) for name, gyro in made.gyro_S.items()}
     truth = {"time": made.time}
     for name, quat in made.quat_WL.items():
         truth |= {f"{name}_q{axis}": quat[:, k] for k, axis in enumerate("xyzw")}

@@ -75,16 +75,15 @@ class KinematicsSolver:
         if is_mechanism:
             self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
         self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
-        self._bent, spherical = [], []
-        for name in () if is_mechanism else self.segments:
-            if model.find_spherical(name) is None:
-                continue
-            relation = _relate(model, name, self.segments)
-            row, above, R_AL, R_AJ, _ = relation
-            if len(R_AJ) > 1:
-                self._bent.append(relation)
-            for joint, R in R_AJ.items() if len(R_AJ) == 1 else ():
-                spherical.append((row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[joint]))
+        exact = [name for name in self.segments if not is_mechanism and model.find_spherical(name) is not None]
+        relations = [_relate(model, name, self.segments) for name in exact]
+        self._bent = [relation for relation in relations if len(relation[3]) > 1]
+        spherical = [
+            (row, above, R.inv().as_quat(), (R_AL.inv() * R).as_quat(), m.idx_qs[joint])
+            for row, above, R_AL, R_AJ, _ in relations
+            for joint, R in R_AJ.items()
+            if len(R_AJ) == 1
+        ]
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._girdles = [
             (describe_girdle(model, name, self.segments), np.array([m.idx_qs[m.getJointId(j)] for j in girdle.joints]))

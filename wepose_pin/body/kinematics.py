@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from ..arguments import EACH_TIME, check_array, check_fields, check_names
 from ..errors import BadData, BadModel, one_of
 from ..recording import check_time, format_span
-from ..rotations import unwrap_signs
 from .body import BodyModel
 from .girdle import MEAN_RAISED, PARAMETERS, follow_law
 from .tree import UNIVERSE
@@ -210,16 +209,6 @@ def compute_link_poses(
     return R, p
 
 
-def compute_link_placements(
-    model: BodyModel, q: np.ndarray, links: Iterable[str]
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Compute link → (`quat_WL` (n, 4) xyzw, `p_WL` (n, 3) [m]), for drawing the body."""
-    links = list(links)
-    R, p = compute_link_poses(model, q, links)
-    quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(len(q), len(links), 4)
-    return {link: (unwrap_signs(quat[:, k]), p[:, k]) for k, link in enumerate(links)}
-
-
 def describe_girdle(model: BodyModel, name: str, segments: Sequence[str]) -> tuple[Any, ...]:
     """Return what `follow_law` needs of a girdle, from `on` to `own`, with orientations of these segments."""
     girdle = model.table.girdles[name]
@@ -359,23 +348,23 @@ def compute_point_covariances(
             return {}
         lengths_cov = shape_cov[: len(model.lengths), : len(model.lengths)]
         return _propagate_through_joints(model, q, segment_cov, lengths_cov, points, heading_cov)
-    R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
+    R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()} | {UNIVERSE: np.eye(3)}
     table, neutral, n = model.table, model.neutral_rotations, len(next(iter(quat_WL.values())))
     lengths, girdles = np.array(list(model.lengths.values())), list(table.girdles)
     moved = {name: move_girdle(model, name, quat_WL) for name in girdles if table.girdles[name].on in R_WL}
     covariances: dict[str, np.ndarray] = {}
     for point in points:
         names, links = model.point_girdles[point], model.reaches[point]
-        carriers = {link: UNIVERSE if link == UNIVERSE else find_carrier(model, link, R_WL) or "" for link in links}
-        if "" in carriers.values() or not set(names) <= set(moved) or not (links or names):
+        carriers = {link: find_carrier(model, link, R_WL) for link in links}
+        if None in carriers.values() or not set(names) <= set(moved) or not (links or names):
             continue
         vectors: dict[str, np.ndarray] = {}  # segment → the sum of what rotates with it, (n, 3) [m] in W
         by_lengths = [by_length for by_length, _ in links.values()]
         own = np.flatnonzero(np.concatenate([np.zeros((1, len(lengths))), *by_lengths]).any(axis=0))
         columns, J, off_law = own.tolist(), np.zeros((n, 3, len(own))), np.zeros((n, 3, 3))
         for link, (by_length, constant) in links.items():
-            carrier = carriers[link]
-            R_WK = np.eye(3) if carrier == UNIVERSE else R_WL[carrier]
+            carrier = str(carriers[link])
+            R_WK = R_WL[carrier]
             if carrier != link:
                 R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
             J += R_WK @ by_length[:, own]

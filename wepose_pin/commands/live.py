@@ -13,27 +13,9 @@ from cyclopts import Group, Parameter
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, ExistingOutput, one_of
 from ..libraries import find_plugins, load_plugin
+from . import options as opt
 from . import stop_requests
-from .options import (
-    MORE,
-    RESEARCH,
-    Address,
-    File,
-    Folder,
-    Force,
-    LiveMethod,
-    Measured,
-    Model,
-    Number,
-    Out,
-    ProtocolName,
-    Robot,
-    Session,
-    Speed,
-    Stature,
-    Subject,
-    described_by,
-)
+from .options import described_by
 from .output import print_diagnostics, print_table, say
 
 if TYPE_CHECKING:
@@ -49,27 +31,27 @@ GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
 def live(
     *,
     source: Annotated[str, Parameter(metavar="SOURCE")],
-    subject: Subject | None = None,
-    session: Session | None = None,
-    setup: Folder | None = None,
+    subject: opt.Subject | None = None,
+    session: opt.Session | None = None,
+    setup: opt.Folder | None = None,
     guide: bool = False,
-    out: Out | None = None,
-    record: File | None = None,
-    robot: Robot | None = None,
+    out: opt.Out | None = None,
+    record: opt.File | None = None,
+    robot: opt.Robot | None = None,
     output: Annotated[tuple[str, ...] | None, Parameter(metavar="NAME:ARGUMENT")] = None,
     page: bool = True,
     open: bool = True,
-    force: Force = False,
-    stature: Annotated[Stature | None, GUIDE] = None,
+    force: opt.Force = False,
+    stature: Annotated[opt.Stature | None, GUIDE] = None,
     sex: Annotated[Literal["f", "m"] | None, GUIDE] = None,
-    measured: Annotated[Measured | None, GUIDE] = None,
-    protocol: Annotated[ProtocolName | None, GUIDE] = None,
-    host: Annotated[Address | None, MORE] = None,
-    port: Annotated[Number, MORE] = 0,
-    model: Annotated[Model | None, MORE] = None,
-    speed: Annotated[Speed, MORE] = "1",
-    accept_failed: Annotated[bool, MORE] = False,
-    method: Annotated[LiveMethod, RESEARCH] = "amekf",
+    measured: Annotated[opt.Measured | None, GUIDE] = None,
+    protocol: Annotated[opt.ProtocolName | None, GUIDE] = None,
+    host: Annotated[opt.Address | None, opt.MORE] = None,
+    port: Annotated[opt.Number, opt.MORE] = 0,
+    model: Annotated[opt.Model | None, opt.MORE] = None,
+    speed: Annotated[opt.Speed, opt.MORE] = "1",
+    accept_failed: Annotated[bool, opt.MORE] = False,
+    method: Annotated[opt.LiveMethod, opt.RESEARCH] = "amekf",
 ) -> None:
     """Track a person live: show the pose in the browser and the terminal, send it to programs or a robot, record it.
 

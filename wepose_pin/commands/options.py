@@ -13,16 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from cyclopts import (
-    App,
-    CycloptsError,
-    Group,
-    Parameter,
-    Token,
-    UnknownOptionError,
-    UnusedCliTokensError,
-    validators,
-)
+from cyclopts import App, CycloptsError, Group, Parameter, Token, UnknownOptionError, UnusedCliTokensError, validators
 from cyclopts.help import HelpPanel
 from rich.console import Console, ConsoleOptions, RenderableType
 

@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 from ..angles import AUTO, Angles, joint_angles
 from ..body import BodyModel, Visual
 from ..body.configuration import solve_configuration
-from ..body.kinematics import Pose, compute_link_placements, find_known_links
+from ..body.kinematics import Pose, compute_link_poses, find_known_links
 from ..errors import BadData
+from ..rotations import unwrap_signs
 from .page import load_template
 from .words import plain
 
@@ -90,12 +91,16 @@ def _place_body(
     model: BodyModel, pose: Pose, samples: np.ndarray
 ) -> tuple[list[Visual], dict[str, tuple[np.ndarray, np.ndarray]]]:
     """The visuals of the links that are known, and link → its orientations and positions in W at these samples."""
-    q = pose.q[samples] if pose.q is not None else None
-    if q is None:
+    if pose.q is None:
         q = solve_configuration(model, {segment: quat_WL[samples] for segment, quat_WL in pose.quat_WL.items()})
+    else:
+        q = pose.q[samples]
     known = set(find_known_links(model, pose.quat_WL))
     visuals = [visual for visual in model.visuals if visual.link in known]
-    return visuals, compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
+    links = list(dict.fromkeys(visual.link for visual in visuals))
+    R_WK, p_WK = compute_link_poses(model, q, links)
+    quats = [unwrap_signs(Rotation.from_matrix(R).as_quat()) for R in R_WK.swapaxes(0, 1)]
+    return visuals, dict(zip(links, zip(quats, p_WK.swapaxes(0, 1), strict=True), strict=True))
 
 
 def find_floor(model: BodyModel) -> float:

@@ -24,12 +24,7 @@ from ..arguments import NonNegative
 from ..compilation import compiled
 from ..errors import WeposeError
 from .collision import NEAR, CollisionModel, NearPairs
-from .limits import (
-    compute_acceleration_bounds,
-    compute_separation_bounds,
-    compute_stop,
-    reduce_acceleration_limits,
-)
+from .limits import compute_acceleration_bounds, compute_separation_bounds, compute_stop, reduce_acceleration_limits
 from .robot import Arm, Robot
 from .targets import HandTarget
 

@@ -199,11 +199,7 @@ def retarget(
 
 
 def _compute_trajectory(
-    arm_targets: ArmTargets,
-    robot: Robot,
-    params: ControllerParams,
-    dt: float,
-    progress: Callable[[str, float], None],
+    arm_targets: ArmTargets, robot: Robot, params: ControllerParams, dt: float, progress: Callable[[str, float], None]
 ) -> Trajectory:
     """Solve the motion with wide limits, slow it, and solve it with the robot's."""
     collision = CollisionModel(robot)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Collection
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -79,8 +80,12 @@ class Activity(BodyMotion):
 
 # Tasks of the arms ----------------------------------------------------------------------------------------------------
 
-# A move: to which posture (k,), in what time [s], for how long it is held [s], and whether the hand types meanwhile.
-_Move = tuple[np.ndarray, float, float, bool]
+
+class _Move(NamedTuple):
+    posture: np.ndarray  # (k,) at its end
+    duration: float  # [s]
+    hold: float  # [s] for which the posture is held then
+    types: bool = False  # the hand types meanwhile
 
 
 class _Path:
@@ -88,20 +93,16 @@ class _Path:
 
     def __init__(self, rest: np.ndarray, stop: float, draw: Callable[[np.ndarray], _Move]) -> None:
         """Go from `rest` (k,) and be back at `stop` [s]; `draw` draws the next move from a posture."""
-        postures, start, durations, at = [rest, rest], [0.0], [1.0], STAND_S
+        postures, begins, durations, at = [rest, rest], [0.0], [1.0], STAND_S
         self.typing: list[tuple[float, float]] = []
-        while True:
-            posture, duration, hold, types = draw(postures[-1])
-            arrived = at + duration
-            if arrived + hold > stop - RAMP_S:
-                break
-            postures.append(posture)
-            start.append(at)
-            durations.append(duration)
-            if types:
-                self.typing.append((arrived, arrived + hold))
-            at += duration + hold
-        self._start, self._duration = np.array([*start, stop - RAMP_S]), np.array([*durations, RAMP_S])
+        while at + (move := draw(postures[-1])).duration + move.hold <= stop - RAMP_S:
+            postures.append(move.posture)
+            begins.append(at)
+            durations.append(move.duration)
+            if move.types:
+                self.typing.append((at + move.duration, at + move.duration + move.hold))
+            at += move.duration + move.hold
+        self._start, self._duration = np.array([*begins, stop - RAMP_S]), np.array([*durations, RAMP_S])
         moved = np.concatenate(([0.0, 0.0], np.cumsum(self._duration[1:])))
         self._values = np.column_stack((np.array([*postures, rest]), moved))
 
@@ -134,7 +135,7 @@ class ArmTasks(Activity):
     def _draw_trunk(rng: np.random.Generator) -> _Move:
         """Draw a move of the trunk, by its rotation vector (3,) [rad]."""
         posture = np.clip(_TRUNK_MEAN + _TRUNK_STD * rng.standard_normal(3), -_TRUNK_MOST, _TRUNK_MOST)
-        return posture, rng.uniform(1.0, 2.5), rng.exponential(3.0), False
+        return _Move(posture, rng.uniform(1.0, 2.5), rng.exponential(3.0))
 
     def _draw_arm(self, rng: np.random.Generator, side: str) -> _Path:
         """Draw the path of an arm: elevation about x and y of the torso, twist, elbow flexion, pronation [rad]."""
@@ -150,7 +151,8 @@ class ArmTasks(Activity):
             duration = max(_SHORTEST_S, np.abs(posture - before).max() / _SPEED * rng.uniform(0.7, 1.5))
             hold, rest = rng.exponential(_PAUSE_S), rng.exponential(_REST_S)
             hold, typing_s = rest if rng.uniform() < _REST_SHARE else hold, rng.uniform(*_TYPING_S)
-            return (posture, duration, typing_s, True) if kind == _TYPING_KIND else (posture, duration, hold, False)
+            types = kind == _TYPING_KIND
+            return _Move(posture, duration, typing_s if types else hold, types)
 
         return _Path(np.array((*pose.upper_arm[side], *pose.elbow[side])), self.stop, draw)
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.signal import lfilter
 
-from ..arguments import NonNegative, Positive, check_fields
+from ..arguments import Count, NonNegative, Positive, PositiveOrInfinite, Range, check_fields
 from ..errors import BadOption
 
 GRAVITY = 9.81  # [m/s^2]
 LONGEST_RUN_S = 0.05  # of lost samples
 _MEAN_RUN_S = 0.02
 _WARM_UP_S = 900.0
+Share = Annotated[float, Range(0.0, closed=True, high=1.0)]
 
 
 @dataclass(frozen=True)
@@ -28,42 +29,36 @@ class Imperfections:
     motion, the mounts or the noise.
     """
 
-    tissue_gain: float = 0.0  # sensors turn on their segments as the joints turn
-    tissue_random: float = 0.0  # … at random while these move, by creep of the strap, and by acceleration across them
-    sensor_place: float = 0.0  # sensors sit half-way along a segment; at 1: at 0.6 of an upper arm, 0.85 of a forearm
-    girdle: float = 0.0  # shoulders follow the arm by de Groot & Brand 2001, and each person's differ from that
-    elbow: float = 0.0  # carrying angle, half in the humerus and half in the forearm, and abduction as the elbow flexes
-    wrists: float = 0.0  # bend in the clasp
-    start_pose: float = 0.0  # offsets of the start pose and of other poses
-    sway: float = 0.0  # of a standing person and hanging arms; breath turns the sensor on the sternum
-    palm_slip: float = 0.0  # [m] palm to palm, rms of the vector's length over the clasp, zero at its ends; half each
-    start_heading_deg: float = 0.0  # std of the torso's heading in the start pose; W's x is then where the feet point
+    tissue_gain: NonNegative = 0.0  # sensors turn on their segments as the joints turn
+    tissue_random: NonNegative = 0.0  # … at random while these move, by creep of the strap, by acceleration
+    sensor_place: Share = 0.0  # sensors sit half-way along a segment; at 1: at 0.6 of an upper arm, 0.85 of a forearm
+    girdle: NonNegative = 0.0  # shoulders follow the arm by de Groot & Brand 2001, and each person's differ from that
+    elbow: NonNegative = 0.0  # carrying angle, half in the humerus, half in the forearm; abduction in flexion
+    wrists: NonNegative = 0.0  # bend in the clasp
+    start_pose: NonNegative = 0.0  # offsets of the start pose and of other poses
+    sway: NonNegative = 0.0  # of a standing person and hanging arms; breath turns the sensor on the sternum
+    palm_slip: NonNegative = 0.0  # [m] palm to palm, rms of the vector's length over the clasp; half each
+    start_heading_deg: NonNegative = 0.0  # std of the torso's heading in the start pose; W's x is that of the feet
     mount: Literal["stated", "any"] = "stated"  # within 10 deg of stated axes; any: uniformly random, nothing stated
-    gyro_scale: float = 0.0  # std of each axis, a share
-    accel_scale: float = 0.0  # the same
-    misalignment_deg: float = 0.0  # std of each sensing axis towards each other axis, of either chip
-    g_sensitivity_deg_s: float = 0.0  # [deg/s per g] what force adds to the gyroscope, std of the matrix's entries
-    gyro_warm_up_deg_s: float = 0.0  # most change of the bias in the first 15 min, log-uniform from a tenth of it
-    gyro_range_deg_s: float = np.inf  # full scale, cut off beyond
-    accel_range_g: float = np.inf  # the same
-    bits: int = 0  # of a sample over the full scale; 0: not quantised
-    clock_jitter: float = 0.0  # [s] std of each sampling time, at most a quarter of a step; the file states even times
-    clock_offset: float = 0.0  # [s] std of each sensor's clock against the stated time
-    clock_drift_ppm: float = 0.0  # std of each clock's rate
-    dropped: float = 0.0  # share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms)
-    accel_average: float = 0.0  # share of the interval that the accelerometer averages; at 1 it is half of it late
+    gyro_scale: NonNegative = 0.0  # std of each axis, a share
+    accel_scale: NonNegative = 0.0  # the same
+    misalignment_deg: NonNegative = 0.0  # std of each sensing axis towards each other axis, of either chip
+    g_sensitivity_deg_s: NonNegative = 0.0  # [deg/s per g] of the gyroscope, std of the matrix's entries
+    gyro_warm_up_deg_s: NonNegative = 0.0  # of the bias in the first 15 min, log-uniform from a tenth of it
+    gyro_range_deg_s: PositiveOrInfinite = np.inf  # full scale, cut off beyond
+    accel_range_g: PositiveOrInfinite = np.inf  # the same
+    bits: Count = 0  # of a sample over the full scale; 0: not quantised
+    clock_jitter: NonNegative = 0.0  # [s] std of each sampling time, at most a quarter of a step; not stated
+    clock_offset: NonNegative = 0.0  # [s] std of each sensor's clock against the stated time
+    clock_drift_ppm: NonNegative = 0.0  # std of each clock's rate
+    # share of samples that each sensor loses, in runs of up to 50 ms (mean 20 ms)
+    dropped: Annotated[float, Range(0.0, closed=True, high=0.2)] = 0.0
+    accel_average: Share = 0.0  # share of the interval that the accelerometer averages; at 1 it is half of it late
 
     def __post_init__(self) -> None:
         check_fields(self, "")
-        for name, value in vars(self).items():
-            off = np.inf if "range" in name else 0.0
-            if name != "mount" and value != off and not 0.0 < value < np.inf:
-                raise BadOption(f"{name} {value} must be above 0, or 0 for off (a range: infinity)")
         if self.bits and not np.isfinite([self.gyro_range_deg_s, self.accel_range_g]).all():
             raise BadOption(f"bits {self.bits} need a finite gyro_range_deg_s and accel_range_g")
-        for name, most in (("dropped", 0.2), ("sensor_place", 1.0), ("accel_average", 1.0)):
-            if getattr(self, name) > most:
-                raise BadOption(f"{name} {getattr(self, name)} must be at most {most:g}")
 
 
 _BODY = ("tissue_gain", "tissue_random", "girdle", "elbow", "wrists", "start_pose", "sway")  # of the literature's size

@@ -114,12 +114,11 @@ class _Circle(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """A piece of the session [s]."""
+    """A part of the session, during which the person moves."""
 
-    kind: str  # the protocol, whose phase has its name
-    start: float
-    stop: float
-    pulse: tuple[float, float, float]  # begin, end and ramp of its motion
+    start: float  # [s]
+    stop: float  # [s]
+    ramp: float  # [s] in which the motion grows and dies away
 
 
 class _Hand(NamedTuple):
@@ -147,7 +146,7 @@ class Motion(BodyMotion):
         self.reach = min(sum(arm) for arm in self.arm.values())
         self.clasp = (STAND_S + _LEAD_S, STAND_S + _LEAD_S + clasp_s)
         self.schedule = _schedule(parts, *self.clasp)
-        self.led = [part for part in self.schedule if part.kind not in _PART_S]  # in which palms are led to a point
+        self.led = next((name for name in parts if name not in _PART_S), "")  # in which palms are led to a point
         names = ("azimuth", "elevation", "radius", "roll", "pitch", "yaw")
         arm_names = (f"{side}_{angle}" for side in SIDES for angle in ("swivel", "pronation"))
         self.wander = {name: Wander(rng) for name in (*names, *arm_names)}
@@ -169,8 +168,8 @@ class Motion(BodyMotion):
             self.circles.append(circle)
             rests.append((circle.pulse[1], circle.pulse[1] + _REST_S[1]))
         self.end = rests[-1][1]
-        self.pulses = [*(part.pulse for part in self.schedule), *(circle.pulse for circle in self.circles)]
-        self.phases |= {part.kind: [(part.start + MARGIN_S, part.stop - MARGIN_S)] for part in self.schedule}
+        self.pulses = [*self.schedule.values(), *(circle.pulse for circle in self.circles)]
+        self.phases |= {k: [(part.start + MARGIN_S, part.stop - MARGIN_S)] for k, part in self.schedule.items()}
         if self.circles:
             self.phases["circles"] = [(self.circles[0].start, self.circles[-1].pulse[1])]
         self.phases["rest"] = [(a + MARGIN_S, b - MARGIN_S) for a, b in rests]
@@ -237,7 +236,7 @@ class Motion(BodyMotion):
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
         """Return the share (n,) of the hands' motion, 0 at both ends of a clasp."""
-        return sum((make_pulse(t, *part.pulse) for part in self.led), np.zeros_like(t))
+        return make_pulse(t, *self.schedule[self.led]) if self.led else np.zeros_like(t)
 
     def _palms(self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         """Return the position (n, 3) [m] in T of each palm before the right one moves to the table."""
@@ -245,13 +244,14 @@ class Motion(BodyMotion):
 
     def _lead_shares(self, t: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return the share (n,) by which each palm leads its arm; 0: the arm hangs."""
-        share, last = np.zeros_like(t), self.schedule[-1]
-        for part in self.led:
-            first = part is self.schedule[0]  # from the N-pose
-            rise = make_step(t, STAND_S, _LEAD_S) if first else make_step(t, part.start - _BLEND_S, _BLEND_S)
-            share = share + rise * (1.0 - (0.0 if part is last else make_step(t, part.stop, _BLEND_S)))
-        if last in self.led:
-            return {"left": share * (1.0 - table), "right": share}  # the left arm returns to hanging
+        if not self.led:
+            return {"left": np.zeros_like(t), "right": table}
+        names, part = list(self.schedule), self.schedule[self.led]
+        from_n_pose = self.led == names[0]
+        rise = make_step(t, STAND_S, _LEAD_S) if from_n_pose else make_step(t, part.start - _BLEND_S, _BLEND_S)
+        if self.led == names[-1]:
+            return {"left": rise * (1.0 - table), "right": rise}  # the left arm returns to hanging
+        share = rise * (1.0 - make_step(t, part.stop, _BLEND_S))
         return {"left": share, "right": share + table}
 
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
@@ -326,9 +326,10 @@ class Motion(BodyMotion):
         lean *= np.deg2rad(_LEAN_DEG * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         lean[:, 1:] += flaws.sway_torso(t)
         R_WT = turn_about("ZYX", lean)
-        for part in (part for part in self.schedule if part.kind == "bow"):
+        if "bow" in self.schedule:
             across = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
-            R_WT = compose(Rotation.from_rotvec(BOW * make_pulse(t, *part.pulse)[:, None] * across), R_WT)
+            bent = BOW * make_pulse(t, *self.schedule["bow"])
+            R_WT = compose(Rotation.from_rotvec(bent[:, None] * across), R_WT)
         starting = 1.0 - make_step(t, STAND_S, _LEAD_S)
         R_WT = compose(R_WT, Rotation.from_rotvec(starting[:, None] * start_pose.torso))
 
@@ -339,7 +340,9 @@ class Motion(BodyMotion):
         palms_T["right"] = palms_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palms_T["right"])
         slips = [gain * wander(t) for gain, wander in zip(self.slip_gain, flaws.slip, strict=True)]
         slip_T = 0.5 * moving[:, None] * np.column_stack(slips)
-        leads = self._lead_shares(t, table)
+        leads, t_pose = self._lead_shares(t, table), np.zeros_like(t)  # the share of the T-pose
+        if (part := self.schedule.get("t_pose")) is not None:
+            t_pose = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S)
 
         pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
@@ -357,35 +360,24 @@ class Motion(BodyMotion):
                 turning + (np.deg2rad(40.0) * table if side == "right" else 0.0),  # palm down on the table
             )
             hanging = (1.0 - lead)[:, None]
-            turn, bend, start = self._hold_poses(t, side)
-            offsets = hanging * start[:, None]
-            turns = (hanging * turn, hanging * flaws.sway_arm(t, side), offsets * start_pose.upper_arm[side])
+            raised, offsets = t_pose[:, None], hanging * (1.0 - t_pose)[:, None]
+            turns = (
+                hanging * (raised * self.raised[side]),
+                hanging * flaws.sway_arm(t, side),
+                offsets * start_pose.upper_arm[side],
+            )
             hang = compose(*(Rotation.from_rotvec(each) for each in turns))
             shoulder_T, R_TU, flexion = self._reach(t, side, hand, hang)
-            elbow = hanging * bend + offsets * start_pose.elbow[side]
+            elbow = hanging * (raised * self.bent[side]) + offsets * start_pose.elbow[side]
             elbow += lead[:, None] * np.column_stack((flexion, hand.pronation))
             R_WU = compose(R_WT, _scale(R_TU, lead), hang)
             R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, *elbow.T))
             place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, hand_F)), flaws)
         return pose
 
-    def _hold_poses(self, t: np.ndarray, side: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what an arm does that hangs or is held in a pose.
 
-        The rotation vector (n, 3) [rad] of the upper arm in T, flexion and pronation about z (n, 2) [rad] of the
-        forearm, and the share (n,) of the offsets of the start pose.
-        """
-        turn, bend, start = np.zeros((len(t), 3)), np.zeros((len(t), 2)), np.ones_like(t)
-        for part in (part for part in self.schedule if part.kind == "t_pose"):
-            held = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S)
-            turn += held[:, None] * self.raised[side]
-            bend += held[:, None] * self.bent[side]
-            start = start * (1.0 - held)
-        return turn, bend, start
-
-
-def _schedule(parts: Sequence[str], begin: float, end: float) -> list[_Part]:
-    """Arrange the parts from `begin` to `end` [s]; the clasp, where there is one, takes the time that is left."""
+def _schedule(parts: Sequence[str], begin: float, end: float) -> dict[str, _Part]:
+    """Arrange the parts, by name, from `begin` to `end` [s]; a clasp takes the time that is left."""
     seconds = [_PART_S[kind][end - begin >= _LONG_S] if kind in _PART_S else 0.0 for kind in parts]
     # Time passes before and after a part but a bow: hands are led there, or arms are raised.
     changes = [_BLEND_S * ((a != "bow") + (b != "bow")) for a, b in pairwise(parts)]
@@ -396,12 +388,11 @@ def _schedule(parts: Sequence[str], begin: float, end: float) -> list[_Part]:
     if left < least:
         needed = end - begin + least - left
         raise BadOption(f"protocol '{'+'.join(parts)}' needs {needed:.0f} s, {end - begin:g} are given")
-    schedule, at = [], begin + first
+    schedule, at = dict[str, _Part](), begin + first
     for kind, fixed, change in zip(parts, seconds, [*changes, last], strict=True):
         # Without a clasp the parts last longer.
         own = left if kind not in _PART_S else fixed + (0.0 if leads else left / len(parts))
-        ramp = _POSE_RAMP_S if kind == "t_pose" else RAMP_S
-        schedule.append(_Part(kind, at, at + own, (at, at + own, ramp)))
+        schedule[kind] = _Part(at, at + own, _POSE_RAMP_S if kind == "t_pose" else RAMP_S)
         at += own + change
     return schedule
 

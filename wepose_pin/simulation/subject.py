@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import Count, Positive, check_arguments, check_names
+from ..arguments import Count, Positive, Range, check_arguments, check_names
 from ..body import DEFAULT_BODY, SEXES, load_model, load_table
 from ..body.girdle import FIXED
 from ..body.kinematics import Pose
@@ -53,7 +53,7 @@ class Simulation:
     accel_S: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], specific force at sample k; NaN where lost
     quat_LS: dict[str, np.ndarray]  # sensor -> (4,) xyzw, exact mount, sensor to segment
     p_LS: dict[str, np.ndarray]  # sensor -> (3,) [m] in L, from hips, shoulder or elbow to the sensor
-    stated_mount: dict[str, tuple[str, str] | None]  # sensor -> its axes that point up, forward; None: not stated
+    stated_mount: tuple[str, str] | None  # axes of every sensor that point up, forward; None: not stated
     gyro_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [rad/s], exact
     accel_bias: dict[str, np.ndarray]  # sensor -> (n, 3) [m/s^2], exact
     lengths: dict[str, float]  # [m]
@@ -72,15 +72,11 @@ class Simulation:
     def recording(self, name: str = "simulated") -> Recording:
         """Return the recording that a user would have, without truth; clock errors stay in the data, as in a file."""
         clock = Clock(self.time, np.arange(len(self.time)), 1.0 / self.rate_hz)
-        sensors = {}
+        sensors, stated = {}, None if self.stated_mount is None else compute_mount(*self.stated_mount)
         for segment, gyro_S in self.gyro_S.items():
             marks = mark_lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
-            stated = self.stated_mount[segment]
-            sensors[segment] = ImuSensor(
-                gyro_S=bridge(gyro_S, marks, clock),
-                accel_S=bridge(self.accel_S[segment], marks, clock),
-                stated_quat_LS=None if stated is None else compute_mount(*stated),
-            )
+            measured = bridge(gyro_S, marks, clock), bridge(self.accel_S[segment], marks, clock)
+            sensors[segment] = ImuSensor(*measured, stated_quat_LS=stated)
         phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
         return check_recording(Recording(name, self.time, self.rate_hz, sensors, phases))
 
@@ -135,7 +131,7 @@ def simulate(
     rate_hz: Positive = 100.0,
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = IDEAL_PRESET,
-    clasp_s: Positive = 60.0,
+    clasp_s: Annotated[float, Range(5.0, closed=True)] = 60.0,
     circles: Count = 6,
     protocol: str = "clasp",
 ) -> Simulation:
@@ -185,8 +181,6 @@ def simulate(
     missing = [name for name in names if name not in lengths]
     if missing:
         raise BadOption(f"lengths: {', '.join(missing)} is missing; each is needed, in metres")
-    if clasp_s < 5.0:
-        raise BadOption(f"clasp_s {clasp_s} must be at least 5")
     parts = protocol.split("+")
     if not set(parts) <= set(PARTS) or len(set(parts)) < len(parts):
         raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(PARTS, protocol)}; or several joined by +")
@@ -290,7 +284,7 @@ def measure_motion(motion: BodyMotion, rate_hz: float, noise: ImuNoise) -> Simul
         quat_WL={segment: true.R_WL[segment].as_quat() for segment in motion.p_LS},
         points=true.points,
         p_LS=dict(motion.p_LS),
-        stated_mount=dict.fromkeys(motion.p_LS, _MOUNT if sizes.mount == "stated" else None),
+        stated_mount=_MOUNT if sizes.mount == "stated" else None,
         lengths=dict(motion.lengths),
         phases=motion.phases,
         imperfections=sizes,
