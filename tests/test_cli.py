@@ -220,7 +220,7 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["calibrate", "s.toml", "-o", "OUT", "--stature", "175"], "stature 175 is not a body height"),
         (["view", "nowhere"], "no pose.parquet in it"),
         (["simulate", "-o", "OUT", "--imperfection", "palm_slide=0"], "palm_slip"),
-        (["simulate", "-o", "OUT", "--imperfection", "palm_slip=much"], "palm_slip = 'much'; a number is needed"),
+        (["simulate", "-o", "OUT", "--imperfection", "palm_slip=much"], "palm_slip = 'much'; a finite number"),
         (["simulate", "-o", "OUT", "--imperfection", "mount=taped"], "there is: stated, any"),
     ],
 )
