@@ -47,7 +47,7 @@ from .least_squares import CONTRADICTED, LeastSquares, compare_measured, estimat
 from .paper import Formulation, solve_paper_calibration
 from .problem import SAMPLE_RATE_HZ, CalibrationProblem, find_layout
 from .protocols import Closure, FreeMotion, Protocol, choose_protocol, load_protocol
-from .result import LEAST_ROTATION, Calibration, assess, measure_doubt, measure_rotations
+from .result import LEAST_ROTATION, OTHER_HEADING, Calibration, assess, measure_doubt, measure_rotations
 
 # One standard deviation [m] of a length measured over the skin, where the user gives none.
 MEASURED_STD = 0.003
@@ -163,7 +163,18 @@ def calibrate(
         fused = fuse_calibrations(earlier, calibration.subject, model.table)
         calibration = replace(calibration, subject=fused, problem=replace(calibration.problem, prior=earlier))
     quality = assess(calibration)
-    return replace(calibration, quality=quality, subject=replace(calibration.subject, quality=quality.quality))
+    subject = replace(calibration.subject, quality=quality.quality)
+    if any(check.quality == "fail" and not check.diagnostic.code.endswith("-uncertain") for check in quality.checks):
+        # Something contradicts the estimate, which its ± does not show.
+        subject = _widen(subject, calibration.problem.prior)
+    return replace(calibration, quality=quality, subject=subject)
+
+
+def _widen(subject: Subject, prior: Subject) -> Subject:
+    """Return a subject with each ± at least that of the prior, and of mounts `OTHER_HEADING`."""
+    least = [OTHER_HEADING[1] if row.startswith("mounts.") else prior.std(row) for row in subject.order]
+    missing = np.fmax(np.square(least) - np.diagonal(subject.covariance), 0.0)  # a row that is not of the prior has NaN
+    return replace(subject, covariance=subject.covariance + np.diag(missing))
 
 
 def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, measured: Mapping[str, float]) -> None:
