@@ -96,7 +96,7 @@ class Files:
 # What of the session is exchanged for what, and what is said.
 SAYS = [
     ("[phases]", "[phases", "session.toml: not valid TOML: Expected"),
-    ("arm.csv", "x", "x: '' is not a known format; there is: .csv"),
+    ("arm.csv", "x", "x: no such file; there is: arm.csv"),
     ("\n[data]", "\nnme = 'x'\n[data]", "session.toml: nme is not a known"),
     ("start = [[0.5, 2.5]]", "still = [[0.5, 2.5]]", "phases.still is called static now: write static = [[from, to]]"),
     ("gyro_unit", "gyr_unit", "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?"),

@@ -166,11 +166,11 @@ def _is_parquet(path: Path) -> bool:
     """Return whether a file is Parquet, else it is a CSV; raise `MissingFile` where it is no table."""
     if path.is_dir():
         raise MissingFile(f"{path}: is a folder; a table is needed here, {', '.join(FORMATS)}")
-    if path.suffix.lower() not in FORMATS:
-        raise MissingFile(f"{path}: '{path.suffix}' is not a known format; {one_of(FORMATS)}")
     if not path.is_file():
         beside = [p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS] if path.parent.is_dir() else []
         raise MissingFile(f"{path}: no such file; {one_of(sorted(beside), path.name)}")
+    if path.suffix.lower() not in FORMATS:
+        raise MissingFile(f"{path}: '{path.suffix}' is not a known format; {one_of(FORMATS)}")
     return path.suffix.lower() == ".parquet"
 
 

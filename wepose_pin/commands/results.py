@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..diagnostics import Diagnostic
-from ..errors import BadOption, MissingFile, WrongOption
+from ..errors import BadOption, MissingFile, WrongOption, one_of
 from . import options as opt
 from .options import described_by
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
@@ -114,7 +114,7 @@ def evaluate(
         Use this table of markers before the one of the package (docs/formats.md).
     """
     from ..body.kinematics import Pose, parse_pose_table
-    from ..data_tables import read_table
+    from ..data_tables import FORMATS, read_table
     from ..evaluation import evaluate as compare
     from ..evaluation import register
     from ..readers import load_session
@@ -131,7 +131,8 @@ def evaluate(
         selected = select_interval(pose.time, tracked.phases, interval, phase)
         file = load_session(truth, gaps=True).truth if truth.suffix == ".toml" or truth.is_dir() else truth
         if file is None:
-            raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
+            needed = 'write truth = "FILE" below its [data], or give FILE in place of the session'
+            raise BadOption(f"{truth}: data.truth is missing; {needed}")
         up, diagnostics = None, tuple[Diagnostic, ...]()
         if file.suffix.lower() in SUFFIXES:
             measured = read_reference(file, markers)
@@ -140,6 +141,8 @@ def evaluate(
             fit = fit or ("segments" if measured.own_frames else "world")
         elif markers is not None:
             raise WrongOption("markers", str(markers), f"a .c3d or .trc as TRUTH; {file.name} has no markers")
+        elif file.is_file() and file.suffix.lower() not in FORMATS:
+            raise BadOption(f"{file}: no reference by its suffix; {one_of((*SUFFIXES, *FORMATS))}")
         else:
             reference = parse_pose_table(read_table(file), str(file))
         if align and fit is not None:

@@ -273,6 +273,8 @@ def _open_device(keys: SensorKeys, contents: dict[Any, Any]) -> Device:
     folder, place = Path(keys.data.file).parent, keys.at("format")
     format = find_format(keys.format, folder, place) if keys.format else detect_format(path)
     if format is None:
+        if not is_array_file(path):
+            read_table(path)  # an error where it is none
         keys.table.names("gyro", WIDTHS["gyro"])  # an error: the session must name the columns of a table
     arguments = path, str(format), keys.use or None, keys.rate_hz
     return _once(contents, arguments, read_device, *arguments)
