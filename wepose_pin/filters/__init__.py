@@ -21,7 +21,7 @@ from ..arguments import check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
-from ..recording.faults import check_arrays, find_gyro_range, find_largest
+from ..recording.faults import check_arrays, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 from .amekf import AMEKF
 from .amekf import AmekfParams as AmekfParams
@@ -309,7 +309,7 @@ def estimate_orientation(
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     limits = ("gyro_S", gyro, HIGHEST_RATE, "rad/s"), ("accel_S", accel, HIGHEST_ACCEL, "m/s^2")
     for name, values, most, unit in limits:
-        largest = find_largest(values)
+        largest = max(values.max(initial=0.0), -values.min(initial=0.0))
         if not largest < np.inf:  # NaN
             raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
         if largest > most:

@@ -25,7 +25,7 @@ from ..errors import BadData
 from ..libraries import check_file, library_errors
 from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor, check_recording
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
-from ..recording.clocks import GOOD, LONG, Clock, bridge, bridge_quat
+from ..recording.clocks import bridge
 from .device import Device, DeviceSensor
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -208,21 +208,19 @@ def build_recording(
     count = sum(len(t.time) for t in ticks) if last is None else last + 1 - first
     time = np.concatenate([t.time for t in ticks])[:count]
     gyro, accel = (np.concatenate([getattr(t, part) for t in ticks])[:count] for part in ("gyro_S", "accel_S"))
-    clock = Clock(time, np.arange(count), 1.0 / rate_hz)
     sensors: dict[str, Sensor] = {}
     for i, name in enumerate(header["sensors"]):
         lost = ~np.isfinite(gyro[:, i]).all(axis=1)
         if lost.all():
             raise BadData(f"{source or header['name']}: sensors.{name} never sent a sample")
-        marks = np.where(lost, LONG, GOOD).astype(np.int8)  # the live session bridged short gaps
-        stated, gap = header["mounts"].get(name), lost if lost.any() else None
+        stated, gap = header["mounts"].get(name), lost if lost.any() else None  # short gaps were bridged live
         mount = None if stated is None else np.array(stated)
         if name in header["orientations"]:
-            quat = bridge_quat(unpack_orientations(gyro[:, i], accel[:, i]), marks, clock)
+            quat = bridge(unpack_orientations(gyro[:, i], accel[:, i]), lost, time)
             sensors[name] = OrientationSensor(quat, mount, gap, header["orientations"][name])
         else:
-            gyro_S = bridge(np.ascontiguousarray(gyro[:, i]), marks, clock)
-            sensors[name] = ImuSensor(gyro_S, bridge(np.ascontiguousarray(accel[:, i]), marks, clock), mount, gap)
+            gyro_S, accel_S = (bridge(np.ascontiguousarray(each[:, i]), lost, time) for each in (gyro, accel))
+            sensors[name] = ImuSensor(gyro_S, accel_S, mount, gap)
     phases = {}
     for name, spans in header["phases"].items():
         inside = [(float(a), float(b)) for a, b in spans if time[0] <= a < time[-1]]

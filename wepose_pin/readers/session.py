@@ -244,13 +244,14 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     for segment, clock in own_clocks.items():
         each = keys[segment]
         place, own_faults = f"{each.path}: {each.table.place}", faults.get(segment, [])
-        signals, gap, marks = _bridge_gaps(place, rows[segment], clock, own_faults, gaps)
+        signals, missing, long_gap = _bridge_gaps(place, rows[segment], clock, own_faults, gaps)
+        gap = long_gap if gaps or own_faults else None
         if "orientation" in signals:
             sensor: Sensor = OrientationSensor(signals["orientation"], each.mount, gap, bool(each.aligned))
         else:
             sensor = ImuSensor(signals["gyro"], signals["accel"], each.mount, gap, gyro_range[segment])
         sensors[segment] = clocks.resample(sensor, clock.time, time) if resampled else sensor
-        diagnostics += _report_bridged_gaps(segment, marks, clock.step)
+        diagnostics += _report_bridged_gaps(segment, missing, long_gap, clock.step)
     rate_hz = clocks.measure_rate(time)
     recording = replace(head, time=time, rate_hz=rate_hz, sensors=sensors, diagnostics=tuple(diagnostics))
     check_recording(recording)
@@ -343,8 +344,11 @@ def _read_columns(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Ma
 
 def _bridge_gaps(
     place: str, rows: Mapping[str, np.ndarray], clock: Clock, faults: Sequence[Fault], gaps: bool
-) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray]:
-    """Put rows on the clock and bridge gaps, long ones where `gaps` are accepted; with `Sensor.gap` and all marks."""
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Put rows on the clock and bridge gaps, long ones where `gaps` are accepted.
+
+    Returns the signals, which samples (n,) are missing, and which are in a long gap; those of `faults` are in gaps too.
+    """
     frozen = np.zeros(len(clock.time), dtype=bool)
     for fault in faults:
         frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
@@ -352,22 +356,19 @@ def _bridge_gaps(
     for signal, values in rows.items():
         check_measured(f"{place}{signal}", values)
         signals[signal], good = _place_on_clock(values, clock, f"{place}{signal}", signal == "orientation")
-        if not good.any():
+        lost |= ~good
+        if lost.all():
             raise BadData(f"{place}{signal}: no numbers from {format_span(clock.time[[0, -1]])}")
-        if not gaps and (long := find_runs(clocks.mark_lost_samples(clock, good) == clocks.LONG)):
+        if not gaps and (long := find_runs(clocks.find_long_gaps(~good, clock.step))):
             first, last = long[0]
             lost_s, row = (last - first) * clock.step, clock.row[:first].max(initial=-1) + 1
             raise BadData(
                 f"{place}{signal}: samples are missing for {lost_s:.3f} s from {clock.time[first]:.3f} s, after row "
                 f"{row}; up to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
             )
-        lost |= ~good
-    marks = clocks.mark_lost_samples(clock, ~lost)
-    for signal, values in signals.items():
-        bridge = clocks.bridge_quat if signal == "orientation" else clocks.bridge
-        signals[signal] = bridge(values, marks, clock)
-    gap = marks == clocks.LONG if gaps or faults else None
-    return signals, gap, np.where(frozen, clocks.GOOD, marks)  # frozen samples have a diagnostic of their own
+    long_gap = clocks.find_long_gaps(lost, clock.step)
+    signals = {signal: clocks.bridge(values, lost, clock.time) for signal, values in signals.items()}
+    return signals, lost & ~frozen, long_gap  # frozen samples have a diagnostic of their own
 
 
 def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -388,12 +389,12 @@ def _place_on_clock(rows: np.ndarray, clock: Clock, place: str, is_quat: bool) -
     return values / np.where(good, norm, np.nan)[:, None], good
 
 
-def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
-    """Report bridged gaps, short ones where they are many, from the marks (n,) of the samples and their step [s]."""
-    long, short = ([last - first for first, last in find_runs(marks == mark)] for mark in (clocks.LONG, clocks.BRIDGED))
+def _report_bridged_gaps(segment: str, missing: np.ndarray, long_gap: np.ndarray, step: float) -> Iterator[Diagnostic]:
+    """Report bridged gaps, short ones where they are many, of the samples (n,) with a step [s]."""
+    long, short = ([last - first for first, last in find_runs(missing & own)] for own in (long_gap, ~long_gap))
     if long:
         facts: dict[str, float | str] = {"samples": sum(long), "gaps": len(long)}
         yield Diagnostic("samples-lost", WARNING, segment, max(long) * step, max(clocks.LONGEST_GAP_S, step), facts)
-    elif sum(short) > MOST_LOST * len(marks):
+    elif sum(short) > MOST_LOST * len(missing):
         facts = {"variant": "short", "longest": max(short) * step}
-        yield Diagnostic("samples-lost", WARNING, segment, sum(short) / len(marks), MOST_LOST, facts)
+        yield Diagnostic("samples-lost", WARNING, segment, sum(short) / len(missing), MOST_LOST, facts)

@@ -156,7 +156,7 @@ class StreamSynchronizer:
         self._clock = np.array([(begin, 1.0 / rate_hz, wait_s, 0, -np.inf)], CLOCK)
         self._sensors = state = np.zeros(k, SENSOR)
         state["is_orientation"] = [name in orientations for name in self.sensors]
-        state["saturation"], state["newest"] = start_saturation(), -np.inf
+        state["saturation"], state["newest"], state["value"] = start_saturation(), -np.inf, np.nan
         self.counts, self.lost, self.frozen = state["counts"], state["lost"], state["frozen"]
         # A sensor may be much faster than the ticks.
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
@@ -196,31 +196,31 @@ def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, ou
     """Take samples from `next_sample` on; returns the next sample and the number of ticks, at most `len(out)`."""
     clock, count = clocks[0], 0
     while True:
-        while count < len(out) and _is_complete(clock, sensors, buffers):
-            _write_tick(clock, sensors, buffers, out[count], out_lost[count])
+        while count < len(out) and _write_tick(clock, sensors, buffers, out[count], out_lost[count]):
             count += 1
         if count == len(out) or next_sample == len(samples):
             return next_sample, count
-        sample, i = samples[next_sample], which[next_sample]
+        i, sample = which[next_sample], samples[next_sample]
         sensor, t = sensors[i], sample[0]
-        if _is_sound(clock, sensor, sample):
-            if not sensor.is_orientation and t > sensor.newest:
-                _watch_values(sensors, sensor, sample)
-            if sensor.frozen and t > sensor.since:
-                sensor.counts[FROZEN] += 1
-                clock.newest = max(clock.newest, t)
-            else:
-                _insert_sample(clock, sensor, buffers[i], sample)
         next_sample += 1
+        if not _is_plausible(clock, sensor, sample):
+            sensor.counts[BAD] += 1
+            continue
+        if not sensor.is_orientation and t > sensor.newest:
+            _watch_values(sensors, sensor, sample)
+        if sensor.frozen and t > sensor.since:
+            sensor.counts[FROZEN] += 1
+            clock.newest = max(clock.newest, t)
+        else:
+            _insert_sample(clock, sensor, buffers[i], sample)
 
 
 @compiled
-def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
+def _is_plausible(clock, sensor, sample):  # type: ignore[no-untyped-def]
     """Return whether a sample and its time are plausible."""
     t, gx, gy, gz, ax, ay, az = sample
     size, force = gx * gx + gy * gy + gz * gz, ax * ax + ay * ay + az * az
     if not (abs(t) < 1e12 and size < HIGHEST_RATE_SQUARED and force < HIGHEST_ACCEL_SQUARED):
-        sensor.counts[BAD] += 1
         return False
     if t > clock.newest + JUMP_S and clock.newest > -np.inf:
         # A single time-stamp outlier must not make hours of ticks; after a real jump several samples continue from it.
@@ -228,7 +228,6 @@ def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
         sensor.jumps = sensor.jumps + 1 if continues else 1
         sensor.jump_time = t
         if sensor.jumps < 4:
-            sensor.counts[BAD] += 1
             return False
     sensor.jumps = 0
     return True
@@ -237,9 +236,9 @@ def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
 @compiled
 def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
     """Find whether a sensor is frozen at this sample, its newest, and at which rates its gyroscope saturates."""
-    t, values, is_first = sample[0], sample[1:], sensor.newest == -np.inf
+    t, values = sample[0], sample[1:]
     sensor.newest = t
-    if not is_first and is_same(sensor.value, values):
+    if is_same(sensor.value, values):
         sensor.repeats += 1.0
         if sensor.repeats < FROZEN_SAMPLES or t - sensor.since <= LONGEST_GAP_S * (1.0 + 1e-6):
             return
@@ -247,8 +246,7 @@ def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
             known = sensor.noisy_s >= NOISY_S and sensor.counts[TAKEN] >= LEARNED
             sensor.frozen = known and sensor.repeats > MOST_REPEATS * sensor.most_repeats
         elif t - sensor.since >= NOISY_S:  # it shows no noise; the others are of its kind
-            for other in range(len(sensors)):
-                sensor.frozen = sensor.frozen or sensors[other].noisy_s >= NOISY_S
+            sensor.frozen = sensors.noisy_s.max() >= NOISY_S
         return
     if not sensor.frozen:
         sensor.most_repeats = max(sensor.most_repeats, sensor.repeats)
@@ -266,11 +264,9 @@ def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
 @compiled
 def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-def]
     """Insert a sample into its sensor's buffer, in order of time."""
-    dt, t, n = clock.dt, sample[0], sensor.buffered
-    i = n
-    while i > 0 and buffer[i - 1, 0] > t - SAME * dt:
-        i -= 1
-    if i < n and buffer[i, 0] < t + SAME * dt:
+    dt, t = clock.dt, sample[0]
+    i = _find_sample(buffer, sensor.buffered, t - SAME * dt)
+    if i < sensor.buffered and buffer[i, 0] < t + SAME * dt:
         sensor.counts[DUPLICATE] += 1
         return
     # Only the first tick has no tick before it: a sample before the beginning is the start of its step.
@@ -279,21 +275,20 @@ def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-de
         if t > clock.newest - clock.wait_s:
             sensor.lost = False  # the next tick waits for it again
         return
-    if n == len(buffer):  # the sensor is ahead by a full buffer and no tick is complete: drop the oldest sample
-        _drop(sensor, buffer, 1)
-        n -= 1
+    if sensor.buffered == len(buffer):  # it is ahead by a full buffer and no tick is complete: drop the oldest sample
+        _drop_samples(sensor, buffer, 1)
         i = max(i - 1, 0)
-    for j in range(n, i, -1):
+    for j in range(sensor.buffered, i, -1):
         buffer[j] = buffer[j - 1]
     buffer[i] = sample
-    sensor.buffered = n + 1
+    sensor.buffered += 1
     sensor.lost = False
     sensor.counts[TAKEN] += 1
     clock.newest = max(clock.newest, t)
 
 
 @compiled
-def _drop(sensor, buffer, count):  # type: ignore[no-untyped-def]
+def _drop_samples(sensor, buffer, count):  # type: ignore[no-untyped-def]
     """Drop the oldest samples of a buffer."""
     for j in range(sensor.buffered - count):
         buffer[j] = buffer[j + count]
@@ -301,43 +296,32 @@ def _drop(sensor, buffer, count):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _is_complete(clock, sensors, buffers):  # type: ignore[no-untyped-def]
-    """Return whether the next tick is complete."""
-    dt, t = clock.dt, clock.begin + clock.tick * clock.dt
-    if clock.newest < t - SAME * dt:
-        return False
-    if clock.newest >= t + clock.wait_s:
-        return True
-    for s in range(len(sensors)):
-        if sensors[s].lost:
-            continue
-        buffer, n = buffers[s], sensors[s].buffered
-        if n == 0 or buffer[n - 1, 0] < t - SAME * dt:
-            return False
-        if buffer[n - 1, 0] >= t + REORDER_S:
-            continue
-        i = _find_sample(buffer, n, t, dt)
-        if i > 0 and buffer[i, 0] - buffer[i - 1, 0] > HOLE * dt and buffer[i - 1, 0] > t - clock.wait_s:
-            return False  # a sample in the gap may still arrive
-    return True
-
-
-@compiled
-def _find_sample(buffer, n, t, dt):  # type: ignore[no-untyped-def]
-    """Find the first sample at or after `t`; n: there is none."""
-    i = 0
-    while i < n and buffer[i, 0] < t - SAME * dt:
-        i += 1
-    return i
+def _find_sample(buffer, n, t):  # type: ignore[no-untyped-def]
+    """Find the first of the `n` samples at or after `t`; n: there is none."""
+    while n > 0 and buffer[n - 1, 0] >= t:
+        n -= 1
+    return n
 
 
 @compiled
 def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-untyped-def]
-    """Write the next tick into `out` (k, 6), and drop the samples that no later tick needs."""
+    """Write the next tick into `out` (k, 6), if it is complete; drop the samples that no later tick needs."""
     dt, t = clock.dt, clock.begin + clock.tick * clock.dt
+    if clock.newest < t - SAME * dt:
+        return False
+    for s in range(len(sensors)):
+        buffer, n = buffers[s], sensors[s].buffered
+        if sensors[s].lost or clock.newest >= t + clock.wait_s:
+            continue
+        if n == 0 or buffer[n - 1, 0] < t - SAME * dt:
+            return False
+        if buffer[n - 1, 0] < t + REORDER_S:
+            i = _find_sample(buffer, n, t - SAME * dt)
+            if i > 0 and buffer[i, 0] - buffer[i - 1, 0] > HOLE * dt and buffer[i - 1, 0] > t - clock.wait_s:
+                return False  # a sample in the gap may still arrive
     for s in range(len(sensors)):
         sensor, buffer, n, level = sensors[s], buffers[s], sensors[s].buffered, sensors[s].saturation.level
-        i = _find_sample(buffer, n, t, dt)
+        i = _find_sample(buffer, n, t - SAME * dt)
         sensor.lost = sensor.lost or i == n
         if not _write_value(buffer, n, i, t, dt, sensor.is_orientation, out[s]):
             sensor.counts[MISSING] += 1
@@ -347,10 +331,9 @@ def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-unty
             out[s, :] = np.nan
         out_lost[s] = sensor.lost
         # The next step begins at the last sample at or before the tick.
-        done = i if i < n and buffer[i, 0] <= t + SAME * dt else i - 1
-        if done > 0:
-            _drop(sensor, buffer, done)
+        _drop_samples(sensor, buffer, max(0, i if i < n and buffer[i, 0] <= t + SAME * dt else i - 1))
     clock.tick += 1
+    return True
 
 
 @compiled
@@ -358,21 +341,19 @@ def _write_value(buffer, n, i, t, dt, is_orientation, out):  # type: ignore[no-u
     """Write the sensor's values at `t` into `out` (6,); `i` is its first sample from `t` on. False: not known."""
     if i == n:
         return False
-    first = i == 0
-    step = 0.0 if first else buffer[i, 0] - buffer[i - 1, 0]
-    if buffer[i, 0] - t <= SAME * dt and (first or step >= (1.0 - 2.0 * SAME) * dt):
+    step = buffer[i, 0] - buffer[i - 1, 0] if i > 0 else np.inf
+    if buffer[i, 0] - t <= SAME * dt and step >= (1.0 - 2.0 * SAME) * dt:
         out[:] = buffer[i, 1:]
         return True
-    bridged = max(LONGEST_GAP_S, dt) * (1.0 + 1e-6)  # [s] as in `clocks`: a single lost sample is always bridged
-    if first or step - dt > bridged:
+    if step - dt > max(LONGEST_GAP_S, dt) * (1.0 + 1e-6):  # as in `clocks`: a single lost sample is always bridged
         return False
     before, after, share = buffer[i - 1, 1:], buffer[i, 1:], (t - buffer[i - 1, 0]) / step
     if is_orientation:  # along the shorter way
-        dot = before[0] * after[0] + before[1] * after[1] + before[2] * after[2] + before[3] * after[3]
-        out[:] = before + share * ((1.0 if dot >= 0.0 else -1.0) * after - before)
-        out[:4] /= np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+        sign = 1.0 if (before[:4] * after[:4]).sum() >= 0.0 else -1.0
+        out[:] = before + share * (sign * after - before)
+        out[:4] /= np.sqrt((out[:4] * out[:4]).sum())
         return True
-    out[:] = before + (min(1.0, share) if step <= HOLE * dt else share) * (after - before)
+    out[:] = before + min(1.0, share) * (after - before)
     if step <= HOLE * dt:
         # Mean rate over (t − dt, t], each sample's rate from the one before to it; mean force of the samples within,
         # or with fewer than two samples the force at t.

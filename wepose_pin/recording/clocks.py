@@ -34,7 +34,6 @@ WITHIN_PACKET, SAME_SIZE, FEWEST_PACKETS = 0.5, 0.8, 5
 SHORTEST_SHARE = 0.1  # of the usual step, that equal times which are spread are apart; less is a clock that stood still
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
-GOOD, BRIDGED, LONG = 0, 1, 2  # marks of samples
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
@@ -65,8 +64,8 @@ def build_clock(time: np.ndarray, place: str, is_device: bool = False) -> Clock:
         pace, unit = ("slower", guess_time_unit(step)) if step > LONGEST_STEP_S else ("faster", None)
         guess = f'; time_unit = "{unit}" would fit' if unit else "; is it in seconds?"
         raise BadData(f"{place}: time grows by {step:g} s from row to row, {pace} than any body sensor{guess}")
-    wide = np.flatnonzero(steps > (1.0 + UNEVEN) * step)
-    lost = np.round(steps[wide] / step) - 1.0
+    # How many rows are lost in each step.
+    lost = np.where(steps > (1.0 + UNEVEN) * step, np.round(steps / step) - 1.0, 0.0)
     if np.quantile(np.abs(steps / step - 1.0), 0.75) > REGULAR:
         # The clock has no rate that shows lost rows: up to a long gap, a sample's rate holds for its whole step.
         lost[lost * step <= max(LONGEST_GAP_S, step)] = 0.0
@@ -76,15 +75,10 @@ def build_clock(time: np.ndarray, place: str, is_device: bool = False) -> Clock:
             f"{place}: time jumps from {format_span(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
-    rows = np.arange(len(time), dtype=np.int32 if len(time) < 2**31 else np.int64)
-    if not lost.any():
-        return Clock(time, rows, step, packet)
-    counts = np.ones(len(time), dtype=int)  # of a row and the lost rows after it
-    counts[wide] += lost.astype(int)
-    row = np.repeat(rows, counts)
-    nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself
-    filled = time[row] + nth * np.append(steps / counts[:-1], 0.0)[row]
-    return Clock(filled, np.where(nth == 0, row, -1), step, packet)
+    sample = np.arange(len(time)) + np.append(0, np.cumsum(lost, dtype=int))  # number of each row on the clock
+    row = np.full(sample[-1] + 1, -1)
+    row[sample] = np.arange(len(time))
+    return Clock(np.interp(np.arange(len(row)), sample, time), row, step, packet)
 
 
 def _spread_packets(time: np.ndarray) -> tuple[int, np.ndarray]:
@@ -185,37 +179,33 @@ def _compute_drift(time: np.ndarray) -> float:
 # Lost samples, and resampling, which preserves total rotation ---------------------------------------------------------
 
 
-def mark_lost_samples(clock: Clock, good: np.ndarray) -> np.ndarray:
-    """Mark every sample (n,) as `GOOD`, `BRIDGED` or `LONG`, by the length of the runs that are not `good` (n,)."""
-    marks = np.full(len(good), GOOD, dtype=np.int8)
-    bridged_s = max(LONGEST_GAP_S, clock.step) * (1.0 + 1e-6)  # a single lost sample always is
-    for first, last in find_runs(~good):
-        marks[first:last] = LONG if (last - first) * clock.step > bridged_s else BRIDGED
-    return marks
+def find_long_gaps(lost: np.ndarray, step: float) -> np.ndarray:
+    """Find which `lost` samples (n,) are in a gap too long to be bridged silently, at a `step` [s]."""
+    long = np.zeros(len(lost), dtype=bool)
+    for first, last in find_runs(lost):  # a single lost sample is always bridged
+        long[first:last] = (last - first) * step > max(LONGEST_GAP_S, step) * (1.0 + 1e-6)
+    return long
 
 
-def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
-    """Fill lost samples of `values` (n, k) linearly in time; at the ends with the nearest value."""
-    lost = marks != GOOD
+def bridge(values: np.ndarray, lost: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Fill the `lost` rows (n,) of `values`, as `interpolate` does from the others at their times (n,) [s]."""
     if not lost.any():
         return values
     filled = values.copy()
-    for k in range(values.shape[1]):
-        filled[lost, k] = np.interp(clock.time[lost], clock.time[~lost], values[~lost, k])
+    filled[lost] = interpolate(time[~lost], values[~lost], time[lost])
     return filled
 
 
-def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
-    """Fill lost unit quaternions of `quat` (n, 4) along the shortest rotation; at the ends with the nearest one."""
-    filled = quat.copy()
-    for first, last in find_runs(marks != GOOD):
-        if first == 0 or last == len(quat):
-            filled[first:last] = quat[last] if first == 0 else quat[first - 1]
-            continue
-        edges = [first - 1, last]
-        turn = Slerp(clock.time[edges], Rotation.from_quat(quat[edges]))
-        filled[first:last] = turn(clock.time[first:last]).as_quat()
-    return filled
+def interpolate(clock: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Interpolate from times `clock` (n,) to `time` (m,), both [s]; beyond its ends the nearest value holds.
+
+    `values` are (n, 4) xyzw, which follow the shortest rotation, or (n, 3), which are linear in time.
+    """
+    if values.shape[1] != 4:
+        return np.column_stack([np.interp(time, clock, axis) for axis in values.T])
+    if len(clock) == 1:
+        return values.repeat(len(time), axis=0)
+    return np.asarray(Slerp(clock, Rotation.from_quat(values))(np.clip(time, clock[0], clock[-1])).as_quat())
 
 
 def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
@@ -228,20 +218,18 @@ def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
     if sensor.gap is not None:
         after = np.clip(np.searchsorted(clock, time - 1e-9), 0, len(clock) - 1)
         gap = sensor.gap[after] | (sensor.gap[np.maximum(after - 1, 0)] & (clock[after] > time + 1e-9))
-    within = np.clip(time, clock[0], clock[-1])
     if isinstance(sensor, OrientationSensor):
-        return replace(sensor, quat_VS=Slerp(clock, Rotation.from_quat(sensor.quat_VS))(within).as_quat(), gap=gap)
-    quat = rotations.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
-    R = Slerp(clock, Rotation.from_quat(quat))(within)
-    rate = rotations.compute_turns(R.as_quat()) / np.diff(time)[:, None]
-    dt = float(time[1] - time[0])
-    if dt < (1.0 + UNEVEN) * float(np.median(np.diff(clock))):
-        accel = np.column_stack([np.interp(within, clock, axis) for axis in sensor.accel_S.T])
+        return replace(sensor, quat_VS=interpolate(clock, sensor.quat_VS, time), gap=gap)
+    steps, dt, accel_S = np.diff(clock), float(time[1] - time[0]), sensor.accel_S
+    quat = interpolate(clock, rotations.integrate(sensor.gyro_S[1:] * steps[:, None]), time)
+    rate = rotations.compute_turns(quat) / np.diff(time)[:, None]
+    if dt < (1.0 + UNEVEN) * float(np.median(steps)):
+        accel = interpolate(clock, accel_S, time)
     else:
         # A mean over each step is the difference of integrals at its ends.
-        trapezes = 0.5 * (sensor.accel_S[1:] + sensor.accel_S[:-1]) * np.diff(clock)[:, None]
+        trapezes = 0.5 * (accel_S[1:] + accel_S[:-1]) * steps[:, None]
         integral = np.concatenate([np.zeros((1, 3)), np.cumsum(trapezes, axis=0)])
         first, last = (np.clip(time + side * dt / 2.0, clock[0], clock[-1]) for side in (-1.0, 1.0))
-        accel = np.column_stack([np.interp(last, clock, axis) - np.interp(first, clock, axis) for axis in integral.T])
+        accel = interpolate(clock, integral, last) - interpolate(clock, integral, first)
         accel /= (last - first)[:, None]
     return replace(sensor, gyro_S=np.concatenate([rate[:1], rate]), accel_S=accel, gap=gap)

@@ -107,7 +107,7 @@ def check_sensors(
 def check_arrays(place: str, rate_hz: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Raise `BadData` where a sensor does not measure; `samples`: sensor → gyro and accel (n, 3), all numbers."""
     floats = {name: [np.ascontiguousarray(each, dtype=float) for each in arrays] for name, arrays in samples.items()}
-    if not any(may_have_faults(values) for arrays in floats.values() for values in arrays):
+    if not any(_may_have_faults(values) for arrays in floats.values() for values in arrays):
         return
     times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in floats.items()}
     for name, (fault, *_) in find_faults(times).items():
@@ -125,7 +125,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     faults: dict[str, list[Fault]] = {}
     for name, (time, *values) in samples.items():
         gyro_S, accel_S = map(np.ascontiguousarray, values)
-        if not (may_have_faults(gyro_S) or may_have_faults(accel_S)):
+        if not (_may_have_faults(gyro_S) or _may_have_faults(accel_S)):
             continue
         own, covered, moves = list[Fault](), np.zeros(len(time), dtype=bool), accel_S.std(axis=0).max() > MOVING
         before = float(np.nextafter(time[0], -np.inf))  # the first sample is faulty, too
@@ -179,21 +179,17 @@ def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def may_have_faults(values):  # type: ignore[no-untyped-def]
-    """Return whether an axis ends as it begins, or `FROZEN_SAMPLES` rows in a row have the same values: few signals do.
-
-    Of so many rows one pair is compared.
-    """
+def _may_have_faults(values):  # type: ignore[no-untyped-def]
+    """Return whether an axis ends as it begins, or `FROZEN_SAMPLES` rows (3,) in a row are the same: few signals do."""
     for k in range(3):
-        if len(values) > 1 and values[0, k] == values[-1, k] == values[len(values) // 2, k]:
+        if len(values) > 1 and values[0, k] == values[-1, k]:
             return True
-    for row in range(1, len(values), FROZEN_SAMPLES - 1):
-        if is_same(values[row - 1], values[row]):
-            run = 0
-            for other in range(max(0, row - FROZEN_SAMPLES), min(len(values), row + FROZEN_SAMPLES)):
-                run = run + 1 if is_same(values[other], values[row]) else 0
-                if run == FROZEN_SAMPLES:
-                    return True
+    repeats = 0
+    for row in range(1, len(values)):
+        same = values[row - 1, 0] == values[row, 0] and is_same(values[row - 1], values[row])
+        repeats = repeats + 1 if same else 0
+        if repeats == FROZEN_SAMPLES - 1:
+            return True
     return False
 
 
@@ -250,8 +246,8 @@ def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
 def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
     """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
     state, values = start_saturation(), np.ascontiguousarray(values)
-    share = (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE)
-    if _may_saturate(values, least) and _may_saturate(values, share * find_largest(values)):
+    largest = max(values.max(initial=0.0), -values.min(initial=0.0))
+    if _has_plateau(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * largest)):
         _watch_all(state, values, least)
     return np.asarray(state["level"][0])
 
@@ -264,32 +260,14 @@ def start_saturation() -> np.ndarray:
 
 
 @kernel
-def find_largest(values):  # type: ignore[no-untyped-def]
-    """Return the largest magnitude of values (n, 3), contiguous; NaN where one is no number."""
-    largest = 0.0
-    for row in range(len(values)):
-        x, y, z = abs(values[row, 0]), abs(values[row, 1]), abs(values[row, 2])
-        if not (x <= largest and y <= largest and z <= largest):  # few rows: a single pass at the speed of memory
-            if np.isnan(x + y + z):
-                return np.nan
-            largest = max(largest, x, y, z)
-    return largest
-
-
-@kernel
-def _may_saturate(values, least):  # type: ignore[no-untyped-def]
-    """Return whether an axis has the same value, `least` or more, in `SHORT_PLATEAU` rows: most signals never do.
-
-    Of three such rows two are an even row and the next one.
-    """
-    for row in range(1, len(values), 2):
+def _has_plateau(values, least):  # type: ignore[no-untyped-def]
+    """Return whether an axis has one value, `least` or more, in `SHORT_PLATEAU` rows: most signals never do."""
+    tolerance = 3.0 * ROUNDING * least
+    for row in range(2, len(values)):
         for k in range(3):
-            value, tolerance = values[row, k], 2.0 * ROUNDING * abs(values[row, k])
-            if abs(value) >= least and abs(value - values[row - 1, k]) <= tolerance:
-                if abs(value - values[max(0, row - 2), k]) <= tolerance:
-                    return True
-                if abs(value - values[min(row + 1, len(values) - 1), k]) <= tolerance:
-                    return True
+            value, before, older = values[row, k], values[row - 1, k], values[row - 2, k]
+            if abs(value - before) <= tolerance and abs(value - older) <= tolerance and abs(value) >= least:
+                return True
     return False
 
 

@@ -17,7 +17,7 @@ from ..body.kinematics import Pose
 from ..body.subject import BodyLength, Subject, population_subject
 from ..errors import BadOption, one_of
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
-from ..recording.clocks import Clock, bridge, mark_lost_samples
+from ..recording.clocks import bridge
 from ..rotations import compose, heading, log
 from .activities import ACTIVITIES
 from .imperfections import GRAVITY, IDEAL_PRESET, MTI_3, Device, Imperfections, ImuNoise, draw_lost, jitter_time
@@ -71,11 +71,10 @@ class Simulation:
 
     def recording(self, name: str = "simulated") -> Recording:
         """Return the recording that a user would have, without truth; clock errors stay in the data, as in a file."""
-        clock = Clock(self.time, np.arange(len(self.time)), 1.0 / self.rate_hz)
         sensors, stated = {}, None if self.stated_mount is None else compute_mount(*self.stated_mount)
         for segment, gyro_S in self.gyro_S.items():
-            marks = mark_lost_samples(clock, np.isfinite(gyro_S).all(axis=1))
-            measured = bridge(gyro_S, marks, clock), bridge(self.accel_S[segment], marks, clock)
+            lost = ~np.isfinite(gyro_S).all(axis=1)
+            measured = bridge(gyro_S, lost, self.time), bridge(self.accel_S[segment], lost, self.time)
             sensors[segment] = ImuSensor(*measured, stated_quat_LS=stated)
         phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
         return check_recording(Recording(name, self.time, self.rate_hz, sensors, phases))
