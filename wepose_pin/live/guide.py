@@ -31,7 +31,7 @@ from ..documents import whole_file
 from ..errors import BadOption, WeposeError
 from ..filters import BEST
 from ..readers import load_session
-from ..recording import Recording, check_recording
+from ..recording import Recording
 from ..recording.arrivals import Samples, Ticks
 from ..report.calibration import render_calibration_report
 from ..report.page import write_pages
@@ -73,7 +73,7 @@ class GuideOptions:
 
     def calibrate(self, source: Recording | Path, entered: Mapping[str, float] = MappingProxyType({})) -> Calibration:
         """Calibrate a recording, with lengths [m] that the person has `entered`; that of a file is saved beside it."""
-        recording = check_recording(source) if isinstance(source, Recording) else load_session(source)
+        recording = source.check(units=False) if isinstance(source, Recording) else load_session(source)
         measured, protocol = {**self.measured, **entered}, choose_parts(self.protocol, recording.phases)
         calibration = calibrate(
             recording,

@@ -17,7 +17,6 @@ from ..calibration.protocols import Step
 from ..calibration.result import format_longest
 from ..diagnostics import join_text, render, render_all
 from ..errors import BadData, BadOption, ExistingOutput, WeposeError
-from ..recording import check_recording
 from ..recording.arrivals import unpack_orientations
 from ..tracking.start_pose import StartPoseDetector
 from .guide import STATURE, Guide, GuideOptions, GuideStep, StepRun
@@ -189,7 +188,7 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
                     first = last - seconds + 1.0 / attempt.clock.rate_hz
                     try:
                         static = replace(attempt.make_recording(), phases={"static": ((first, last),)})
-                        check_units(check_recording(static))
+                        check_units(static.check(units=False))
                     except BadData as error:
                         reason = str(error)
                         break

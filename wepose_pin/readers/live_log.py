@@ -23,7 +23,7 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData
 from ..libraries import check_file, library_errors
-from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor, check_recording
+from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
 from ..recording.clocks import bridge
 from .device import Device, DeviceSensor
@@ -120,7 +120,7 @@ def read_live_log(path: Path) -> LiveRecording:
         ticks_of_resets = (int(event["tick"]) for event in events if event["kind"] == "reset")
         resets = tuple(tick for tick in ticks_of_resets if tick < synchronizer.next_tick)
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, resets)
-    recording = replace(check_recording(recording), marks=tuple(markers.texts))
+    recording = replace(recording.check(units=False), marks=tuple(markers.texts))
     if not is_complete:
         recording = replace(recording, diagnostics=(Diagnostic("file-incomplete", WARNING, path.name),))
     first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0

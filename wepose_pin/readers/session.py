@@ -22,7 +22,6 @@ from ..recording import (
     OrientationSensor,
     Recording,
     Sensor,
-    check_recording,
     clocks,
     compute_mount,
     read_axes,
@@ -254,7 +253,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         diagnostics += _report_bridged_gaps(segment, missing, long_gap, clock.step)
     rate_hz = clocks.measure_rate(time)
     recording = replace(head, time=time, rate_hz=rate_hz, sensors=sensors, diagnostics=tuple(diagnostics))
-    check_recording(recording)
+    recording.check(units=False)
     return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
 
 

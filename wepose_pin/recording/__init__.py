@@ -23,7 +23,6 @@ from ..errors import BadData, BadOption, BadPhase, one_of
 from .faults import check_arrays
 from .intervals import Intervals as Intervals
 from .intervals import check_phases as check_phases
-from .intervals import check_selection as check_selection
 from .intervals import check_time as check_time
 from .intervals import find_runs as find_runs
 from .intervals import format_span as format_span
@@ -256,13 +255,51 @@ class Recording:
         check_arrays(f"{name}: sensors.", rate_hz, {each: (s.gyro_S, s.accel_S) for each, s in recording.imus.items()})
         return recording
 
-    def check(self) -> Recording:
-        """Check a recording that was built in code, as `check_recording`, and its unit of force; return it."""
-        check_recording(self)
-        for segment, sensor in self.imus.items():
-            force = float(np.median(np.linalg.norm(sensor.accel_S, axis=1)))
+    def check(self, units: bool = True) -> Recording:
+        """Check a recording and return it; `units`: its unit of force too, by the median.
+
+        `BadOption`: a field has a wrong type. `BadData`: shapes differ, samples are too few, a number is not finite,
+        time does not increase or contradicts the rate, specific force is not in m/s². `BadPhase`: a phase is empty or
+        outside the recording.
+        """
+        where, time, count = self.where(), self.time, len(self)
+        check_fields(self, f"{where}: ")
+        if not self.sensors:
+            raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
+        if count < 2:
+            raise BadData(f"{where}: time has {count} samples; a recording has at least 2")
+        check_array(f"{where}: time", time, (count,), kind="missing")
+        check_time(where, time)
+        steps, seconds = count - 1, float(time[-1] - time[0])
+        if abs(seconds * self.rate_hz - steps) > max(1.0, RATE_ERROR * steps):
+            raise BadData(
+                f"{where}: rate_hz = {self.rate_hz:g}, and time has {steps / seconds:.6g} samples a second; they must "
+                f"agree to {100.0 * RATE_ERROR:g} %"
+            )
+        k = int(np.argmax(np.diff(time)))
+        if (time[k + 1] - time[k]) * self.rate_hz > LONGEST_STEP:
+            raise BadData(
+                f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {self.rate_hz:g} Hz; "
+                f"fill or cut the gap first"
+            )
+        if not all(0 <= tick < count for tick in self.resets):
+            raise BadOption(f"{where}: resets = {self.resets}: samples from 0 to {count - 1} are needed")
+        for segment, sensor in self.sensors.items():
+            place = f"{where}: sensors.{segment}"
+            if isinstance(sensor, ImuSensor):
+                check_array(f"{place}.gyro", sensor.gyro_S, (count, 3), EACH_TIME)
+                check_array(f"{place}.accel", sensor.accel_S, (count, 3), EACH_TIME)
+            else:
+                check_array(f"{place}.orientation", sensor.quat_VS, (count, 4), EACH_TIME, unit=1e-6)
+            if sensor.stated_quat_LS is not None:
+                check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
+            if sensor.gap is not None:
+                check_array(f"{place}.gap", sensor.gap, (count,), EACH_TIME, kind="flag")
+        check_phases(where, time, self.phases)
+        for segment, imu in self.imus.items() if units else ():
+            force = float(np.median(np.linalg.norm(imu.accel_S, axis=1)))
             if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
-                text = f"{self.where()}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed"
+                text = f"{where}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed"
                 raise BadData(f"{text}, 9.8 where nothing moves")
         return self
 
@@ -334,46 +371,3 @@ def join_recordings(first: Recording, second: Recording) -> Recording:
     diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
     time = np.concatenate([first.time, second.time])
     return replace(first, time=time, sensors=sensors, resets=resets, diagnostics=diagnostics)
-
-
-def check_recording(recording: Recording) -> Recording:
-    """Check a recording and return it.
-
-    `BadOption`: a field has a wrong type. `BadData`: shapes differ, samples are too few, a number is not finite, time
-    does not increase or contradicts the rate. `BadPhase`: a phase is empty or outside the recording.
-    """
-    where, time = recording.where(), recording.time
-    check_fields(recording, f"{where}: ")
-    if not recording.sensors:
-        raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
-    if len(time) < 2:
-        raise BadData(f"{where}: time has {len(time)} samples; a recording has at least 2")
-    check_array(f"{where}: time", time, (len(time),), kind="missing")
-    check_time(where, time)
-    steps, seconds = len(time) - 1, float(time[-1] - time[0])
-    if abs(seconds * recording.rate_hz - steps) > max(1.0, RATE_ERROR * steps):
-        raise BadData(
-            f"{where}: rate_hz = {recording.rate_hz:g}, and time has {steps / seconds:.6g} samples a second; they must "
-            f"agree to {100.0 * RATE_ERROR:g} %"
-        )
-    k = int(np.argmax(np.diff(time)))
-    if (time[k + 1] - time[k]) * recording.rate_hz > LONGEST_STEP:
-        raise BadData(
-            f"{where}: time goes from {time[k]:.3f} to {time[k + 1]:.3f} s in one step at {recording.rate_hz:g} Hz; "
-            f"fill or cut the gap first"
-        )
-    if not all(0 <= tick < len(time) for tick in recording.resets):
-        raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
-    for segment, sensor in recording.sensors.items():
-        place, count = f"{where}: sensors.{segment}", len(time)
-        if isinstance(sensor, ImuSensor):
-            check_array(f"{place}.gyro", sensor.gyro_S, (count, 3), EACH_TIME)
-            check_array(f"{place}.accel", sensor.accel_S, (count, 3), EACH_TIME)
-        else:
-            check_array(f"{place}.orientation", sensor.quat_VS, (count, 4), EACH_TIME, unit=1e-6)
-        if sensor.stated_quat_LS is not None:
-            check_array(f"{place}.stated_quat_LS", sensor.stated_quat_LS, (4,), unit=1e-6)
-        if sensor.gap is not None:
-            check_array(f"{place}.gap", sensor.gap, (count,), EACH_TIME, kind="flag")
-    check_phases(where, time, recording.phases)
-    return recording

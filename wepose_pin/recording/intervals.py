@@ -56,17 +56,6 @@ def _is_beyond(time: np.ndarray, first: float, last: float) -> bool:
     return bool(first < time[0] - slack or last > time[-1] + slack)
 
 
-def check_selection(interval: tuple[float, float] | None, phase: str | None = None) -> None:
-    """Raise `WrongOption` where the interval [s] does not run forwards, or a phase is given besides."""
-    if interval is None:
-        return
-    shown = f"{interval[0]:g} {interval[1]:g}"
-    if not interval[0] < interval[1]:
-        raise WrongOption("interval", shown, "two times in seconds are needed, the earlier one first")
-    if phase is not None:
-        raise WrongOption("interval", shown, f"--phase {phase} is given too; only one of them can select the time")
-
-
 def select_interval(
     time: np.ndarray,
     phases: Mapping[str, Sequence[tuple[float, float]]],
@@ -76,13 +65,17 @@ def select_interval(
     """Return the interval [s] that --interval or --phase selects; None: neither is given.
 
     It may exceed `time` (n,) [s] by `MOST_BEYOND` samples at each end. Of a phase with several intervals ``NAME:2`` is
-    the second. `WrongOption`: both are given; the interval is outside the recording; there is no such phase or number.
+    the second. `WrongOption`: both are given; the interval is empty or outside the recording; no such phase or number.
     """
-    check_selection(interval, phase)
-    if phase is None:
-        if interval is not None and _is_beyond(time, *interval):
-            shown = f"{format_time(interval[0])} {format_time(interval[1])}"
+    if interval is not None:
+        shown = f"{format_time(interval[0])} {format_time(interval[1])}"
+        if not interval[0] < interval[1]:
+            raise WrongOption("interval", shown, "two times in seconds are needed, the earlier one first")
+        if phase is not None:
+            raise WrongOption("interval", shown, f"--phase {phase} is given too; only one of them can select the time")
+        if _is_beyond(time, *interval):
             raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
+    if phase is None:
         return interval
     name, number = phase, 0
     if phase not in phases and (numbered := re.fullmatch(r"(.+):(\d{1,6})", phase)):

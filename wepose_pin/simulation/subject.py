@@ -16,7 +16,7 @@ from ..body.girdle import FIXED
 from ..body.kinematics import Pose
 from ..body.subject import BodyLength, Subject, population_subject
 from ..errors import BadOption, one_of
-from ..recording import ImuSensor, Recording, check_recording, compute_mount
+from ..recording import ImuSensor, Recording, compute_mount
 from ..recording.clocks import bridge
 from ..rotations import compose, heading, log
 from .activities import ACTIVITIES
@@ -77,7 +77,7 @@ class Simulation:
             measured = bridge(gyro_S, lost, self.time), bridge(self.accel_S[segment], lost, self.time)
             sensors[segment] = ImuSensor(*measured, stated_quat_LS=stated)
         phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
-        return check_recording(Recording(name, self.time, self.rate_hz, sensors, phases))
+        return Recording(name, self.time, self.rate_hz, sensors, phases).check(units=False)
 
     @property
     def girdles(self) -> dict[str, np.ndarray]:
