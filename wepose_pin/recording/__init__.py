@@ -262,8 +262,9 @@ class Recording:
         time does not increase or contradicts the rate, specific force is not in m/s². `BadPhase`: a phase is empty or
         outside the recording.
         """
-        where, time, count = self.where(), self.time, len(self)
+        where, time = self.where(), self.time
         check_fields(self, f"{where}: ")
+        count = len(time)
         if not self.sensors:
             raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
         if count < 2:
