@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from numba import njit, types
@@ -39,26 +40,21 @@ class _CompilationNotice(Listener):  # type: ignore[misc]
 register("numba:compile", _CompilationNotice())
 
 
-def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+def _compile_cached(options: dict[str, Any], function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function by numba and cache it for the next start, where a folder is writable."""
     try:
         return njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor a home is writable
         return njit(**options)(function)
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function by numba and cache it for the next start, where a folder is writable."""
-    return _compile_cached(function, _OPTIONS)
-
-
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile as `compiled`, for a function that allocates no array: without reference counts."""
-    return _compile_cached(function, _BARE | {"forceinline": True})
-
-
-def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a part of kernels, which is always inlined in its caller and allocates no array."""
-    return njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_BARE)(function)
+compiled = partial(_compile_cached, _OPTIONS)
+# For a function that allocates no array: without reference counts.
+kernel = partial(_compile_cached, _BARE | {"forceinline": True})
+# For a part of kernels, which is always inlined in its caller and allocates no array.
+inlined: Callable[[Callable[..., Any]], Any] = njit(
+    forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_BARE
+)
 
 
 @intrinsic

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from .errors import BadData, MissingFile, UnknownColumn, one_of
+from .errors import BadData, MissingFile, one_of
 from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
@@ -134,13 +134,13 @@ def _find_ragged(path: Path, body: bytes, width: int, separator: str) -> None:
 def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str) -> np.ndarray:
     """Read columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
 
-    Raise `UnknownColumn` where a name is not in the table, `BadData` where a column has other values than numbers, or
-    its name occurs twice; `file` and `place` (such as ``sensors.torso.gyro``) begin the text.
+    Raise `BadData` where a name is not in the table or occurs twice, or a column has other values than numbers; `file`
+    and `place` (such as ``sensors.torso.gyro``) begin the text.
     """
     columns = []
     for name in names:
         if name not in table.columns:
-            raise UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
+            raise BadData(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
         if f"{name}_duplicated_0" in table.columns:
             raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
         series, holds = table[name], f"{file}: column '{name}' holds"

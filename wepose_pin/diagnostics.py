@@ -16,7 +16,7 @@ from functools import lru_cache
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 
 class Severity(StrEnum):
@@ -162,17 +162,18 @@ def quantity(value: float | None, unit: str) -> str:
     return (text.rstrip("0").rstrip(".") if "." in text else text) + name
 
 
-def _fill(template: str, known: Mapping[str, Any]) -> str:
-    """Fill in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
+class _Fact(NamedTuple):
+    """A fact in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
 
-    def write(match: re.Match[str]) -> str:
-        if match[1] is None:
-            return match[0][0]  # a doubled brace
-        value, unit = known[match[1]], match[2]
-        text = quantity(value, unit) if unit and unit != "name" else str(value)
+    value: Any
+
+    def __format__(self, unit: str) -> str:
+        text = quantity(self.value, unit) if unit and unit != "name" else str(self.value)
         return text.replace("_", " ") if unit == "name" else text
 
-    text = re.sub(r"\{\{|\}\}|\{(\w+)(?::([^}]+))?\}", write, template)
+
+def _fill(template: str, known: Mapping[str, Any]) -> str:
+    text = template.format_map({name: _Fact(value) for name, value in known.items()})
     # A name at the beginning of a sentence; a file's name stays as it is.
     return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
 

@@ -58,12 +58,8 @@ class Named(dict[str, T]):
         raise UnknownKey(f"no {self.kind} '{name}'; {one_of(self, name)}")
 
 
-class UnknownColumn(WeposeError):
-    """A column that the session names is not in the data."""
-
-
 class BadData(WeposeError):
-    """The recorded numbers cannot be a recording: text, NaN, time that goes back, lengths that differ."""
+    """The data cannot be a recording: no such column, text, NaN, time that goes back, lengths that differ."""
 
 
 class WrongUnit(BadData):

@@ -210,10 +210,7 @@ def integrate(rotvec):  # type: ignore[no-untyped-def]
 
 def unroll(rotvec: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Vectors (n, 3), each turned by all of `rotvec` (n, 3) [rad] up to its own; one that is no number is no turn."""
-    quat, R, (x, y, z) = (
-        integrate(np.where(np.isfinite(rotvec), rotvec, 0.0))[1:],
-        np.empty((3, 3, len(vectors))),
-        vectors.T,
-    )
+    quat = integrate(np.where(np.isfinite(rotvec), rotvec, 0.0))[1:]
+    R, (x, y, z) = np.empty((3, 3, len(vectors))), vectors.T
     write_matrix(quat.T, R)  # type: ignore[no-untyped-call]
     return np.ascontiguousarray((R[:, 0] * x + R[:, 1] * y + R[:, 2] * z).T)

@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 from scipy.io import loadmat
 
-from ..errors import BadData, UnknownColumn, one_of
+from ..errors import BadData, one_of
 from ..libraries import check_file, import_library, library_errors
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
@@ -66,7 +66,7 @@ class ArrayFile:
             values = values.reshape(len(values), -1)
             if k >= values.shape[1] or (part is None and values.shape[1] > 1):
                 shape = f"one column of {self.path.name}, whose {array} has shape {values.shape}"
-                raise UnknownColumn(f"{place}: {name} is not {shape}; name one as {array}[0]")
+                raise BadData(f"{place}: {name} is not {shape}; name one as {array}[0]")
             columns[name] = np.ascontiguousarray(values[:, k])
         if len({len(values) for values in columns.values()}) > 1:
             listed = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
@@ -83,7 +83,7 @@ class ArrayFile:
     def _find(self, name: str, place: str) -> str:
         path = "/" + name.replace(".", "/").strip("/")
         if path not in self.shapes:
-            raise UnknownColumn(f"{place}: no array '{name}' in {self.path.name}; {one_of(self.shapes, path)}")
+            raise BadData(f"{place}: no array '{name}' in {self.path.name}; {one_of(self.shapes, path)}")
         return path
 
     def _read_array(self, path: str) -> np.ndarray:

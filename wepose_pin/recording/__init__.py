@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..arguments import EACH_TIME, Positive, check_array, check_fields, check_value
+from ..arguments import EACH_TIME, Positive, check_array, check_fields, check_names, check_value
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, one_of
@@ -237,6 +237,7 @@ class Recording:
         """
         check_value("rate_hz", rate_hz, Positive)
         check_value("mounts", mounts or {}, Mapping[str, tuple[str, str]])
+        check_names("mounts", mounts or {}, sensors)
         built: dict[str, Sensor] = {}
         count = 0
         for segment, values in sensors.items():
