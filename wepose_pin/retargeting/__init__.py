@@ -13,7 +13,6 @@ from .files import find_self_collisions as find_self_collisions
 from .files import summarize as summarize
 from .files import write_trajectory as write_trajectory
 from .maps import ROBOTS as ROBOTS
-from .maps import RobotMap as RobotMap
 from .maps import find_map as find_map
 from .maps import read_map as read_map
 from .robot import Robot as Robot
@@ -21,7 +20,6 @@ from .robot import load_robot as load_robot
 from .stream import ArmObserver as ArmObserver
 from .stream import Command as Command
 from .stream import CommandStream as CommandStream
-from .targets import ArmTargets as ArmTargets
 from .targets import compute_arm_targets as compute_arm_targets
 from .trajectory import Trajectory as Trajectory
 from .trajectory import retarget as retarget

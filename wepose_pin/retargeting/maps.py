@@ -10,14 +10,13 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from ..body.urdf import find_example_data, read_urdf
-from ..documents import Key, TomlTable, is_number, read_record, read_toml
+from ..documents import Finite, Key, TomlTable, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
 from ..libraries import asset
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
-MAX_VALUE = 1e6  # of a number in a map
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
 
@@ -168,7 +167,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         acceleration=acceleration,
         jerk=jerk | _read_joint_values(limits, "jerk", joints),
         velocity=_read_joint_values(limits, "velocity", joints),
-        position=_read_ranges(limits.table("position", {})),
+        position=_read_ranges(limits),
     )
 
 
@@ -196,20 +195,15 @@ def _check_axes(table: TomlTable, first: str, second: str) -> None:
 
 def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[str, float]:
     """Read one number for all joints, or a table with a number for each."""
-    value = limits.values.get(key, {})
-    if is_number(value, MAX_VALUE):
-        return dict.fromkeys(joints, float(value))
-    if not isinstance(value, Mapping) or not all(is_number(number, MAX_VALUE) for number in value.values()):
-        raise BadModel(
-            f"{limits.at(key)} = {value!r}; a number for all joints, or a table with one for each, is needed"
-        )
-    return {name: float(number) for name, number in value.items()}
+    value = limits.get(key, {}, Finite | Mapping[str, Finite])
+    values = value if isinstance(value, Mapping) else dict.fromkeys(joints, value)
+    return {name: float(number) for name, number in values.items()}
 
 
-def _read_ranges(table: TomlTable) -> dict[str, tuple[float, ...]]:
+def _read_ranges(limits: TomlTable) -> dict[str, tuple[float, ...]]:
     """Read joint → lower and upper limit."""
-    for name, value in table.values.items():
-        is_pair = isinstance(value, list) and len(value) == 2 and all(is_number(each, MAX_VALUE) for each in value)
-        if not is_pair or not value[0] < value[1]:
-            raise BadModel(f"{table.at(name)} = {value!r}; [lower, upper] in rad or m is needed, the first smaller")
-    return {name: tuple(map(float, value)) for name, value in table.values.items()}
+    ranges = limits.get("position", {}, Mapping[str, tuple[Finite, Finite]])
+    for name, (lower, upper) in ranges.items():
+        if not lower < upper:
+            raise BadModel(f"{limits.at('position')}.{name} = [{lower:g}, {upper:g}]; the first must be smaller")
+    return {name: (float(lower), float(upper)) for name, (lower, upper) in ranges.items()}

@@ -20,7 +20,6 @@ from .imperfections import PRESETS as PRESETS
 from .imperfections import Imperfections as Imperfections
 from .imperfections import ImuNoise as ImuNoise
 from .motion import CIRCLING_POINT as CIRCLING_POINT
-from .motion import SEGMENTS as SEGMENTS
 from .people import SIDES as SIDES
 from .subject import MEASURED_LENGTHS as MEASURED_LENGTHS
 from .subject import MEASURED_STD as MEASURED_STD

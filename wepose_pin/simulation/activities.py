@@ -220,9 +220,9 @@ class WholeBodyActivity(Activity):
         """Return the rotation of the upper arm in the torso."""
         return turn_about("Y", -self.arm(side, t)[:, :1])
 
-    def root(self, _t: np.ndarray, /) -> np.ndarray | None:
-        """Return where the root is (n, 3) [m] in a world at rest; None: it does not move."""
-        return None
+    def root(self, t: np.ndarray, /) -> np.ndarray:
+        """Return where the root is (n, 3) [m] in a world at rest."""
+        return np.zeros((len(t), 3))
 
     def __call__(self, t: np.ndarray, segments: Collection[str] = tuple(SIDES)) -> BodyPose:
         sides = [side for side in SIDES if any(segment.startswith(side) for segment in segments)]
@@ -239,9 +239,8 @@ class WholeBodyActivity(Activity):
             along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
             shoulder_T = girdle.place(SIDES[side], self.moving_time(t)) + girdle.displace(along_T, SIDES[side])
             place_arm(pose, side, origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.flaws)
-        if (root := self.root(t)) is not None:
-            pose = pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
-        return pose
+        root = self.root(t)
+        return pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
 
     def _orientations(self, t: np.ndarray, sides: Collection[str]) -> dict[str, Rotation]:
         start = self.flaws.start_pose
@@ -285,16 +284,13 @@ class Walk(WholeBodyActivity):
     """
 
     phase = "walk"
-    # Share of the stride, from the foot's first contact; hip flexion, knee flexion, ankle dorsiflexion [deg].
+    # Share of the stride at the initial contact, loading response, mid and terminal stance, pre-swing, initial, mid and
+    # terminal swing; then hip flexion, knee flexion and ankle dorsiflexion [deg] there.
     _STRIDE = (
-        (0.00, 20.0, 5.0, 0.0),  # initial contact
-        (0.12, 20.0, 15.0, -5.0),  # loading response
-        (0.31, 0.0, 5.0, 5.0),  # mid stance
-        (0.50, -20.0, 10.0, 10.0),  # terminal stance
-        (0.62, -10.0, 40.0, -15.0),  # pre-swing
-        (0.75, 15.0, 60.0, -5.0),  # initial swing
-        (0.87, 25.0, 25.0, 0.0),  # mid swing
-        (1.00, 20.0, 5.0, 0.0),  # terminal swing
+        (0.00, 0.12, 0.31, 0.50, 0.62, 0.75, 0.87, 1.00),
+        (20.0, 20.0, 0.0, -20.0, -10.0, 15.0, 25.0, 20.0),
+        (5.0, 15.0, 5.0, 10.0, 40.0, 60.0, 25.0, 5.0),
+        (0.0, -5.0, 5.0, 10.0, -15.0, -5.0, 0.0, 0.0),
     )
     _STRIDE_S = 1.06  # 113 steps a minute, Perry & Burnfield 2010
     # Right side down and up, mean of forward and its change, turn. At the right foot's first contact the right side of
@@ -306,7 +302,7 @@ class Walk(WholeBodyActivity):
     def prepare(self, rng: np.random.Generator) -> None:
         self.stride_s = self._STRIDE_S * rng.uniform(0.92, 1.08)
         self.size = rng.uniform(0.85, 1.15, 3)  # of hip, knee and ankle
-        share, *angles = np.array(self._STRIDE).T
+        share, *angles = self._STRIDE
         self.curves = CubicSpline(share, np.radians(angles).T, bc_type="periodic")
 
     def _cycle(self, t: np.ndarray, side: str) -> np.ndarray:
@@ -346,14 +342,10 @@ class Run(Walk):
 
     phase = "run"
     _STRIDE = (
-        (0.00, 35.0, 15.0, 5.0),
-        (0.15, 25.0, 40.0, 20.0),
-        (0.35, -10.0, 15.0, -20.0),
-        (0.50, -5.0, 55.0, -15.0),
-        (0.65, 25.0, 95.0, 0.0),
-        (0.80, 45.0, 80.0, 5.0),
-        (0.92, 42.0, 25.0, 5.0),
-        (1.00, 35.0, 15.0, 5.0),
+        (0.00, 0.15, 0.35, 0.50, 0.65, 0.80, 0.92, 1.00),
+        (35.0, 25.0, -10.0, -5.0, 25.0, 45.0, 42.0, 35.0),
+        (15.0, 40.0, 15.0, 55.0, 95.0, 80.0, 25.0, 15.0),
+        (5.0, 20.0, -20.0, -15.0, 0.0, 5.0, 5.0, 5.0),
     )
     _STRIDE_S = 0.72
     _PELVIS_DEG, _TORSO_DEG = (-5.0, 8.0, 3.0, 8.0), (3.0, 10.0, 2.0, -12.0)

@@ -86,10 +86,8 @@ class BodyMotion(ABC):
 
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         """Return the time (n,) [s] that a segment has moved up to `t`: the integral of its activity."""
-        moved = np.zeros_like(t)
-        for begin, end, ramp in self.pulses:  # whose ramps do not overlap
-            moved = moved + (integrate_step(t, begin, ramp) - integrate_step(t, end - ramp, ramp))
-        return moved
+        moved = (integrate_step(t, a, ramp) - integrate_step(t, b - ramp, ramp) for a, b, ramp in self.pulses)
+        return sum(moved, np.zeros_like(t))  # their ramps do not overlap
 
 
 class _Circle(NamedTuple):

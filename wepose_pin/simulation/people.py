@@ -119,6 +119,8 @@ class Flaws:
 
     def __init__(self, sizes: Imperfections, seed: int, lengths: Mapping[str, float]) -> None:
         self.sizes, self.lengths = sizes, lengths
+        # Whether the place of a hand follows from the arm's angles in steps only.
+        self.iterates = any((sizes.girdle, sizes.wrists, sizes.elbow))
         rngs = dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
         self.rngs: Streams = rngs
         self.girdle = SimulatedGirdle(sizes, rngs, lengths)
@@ -128,11 +130,6 @@ class Flaws:
         self.tilt = Process(rngs["sway_tilt"], _TILT_S, 2)
         self.slip = [Wander(rngs["palm_slip"]) for _ in range(3)]
         self.sway = {name: Sway(rngs["sway"]) for name in ("torso", *SIDES)}
-
-    @property
-    def iterates(self) -> bool:
-        """True where the place of a hand follows from the arm's angles in steps only."""
-        return any((self.sizes.girdle, self.sizes.wrists, self.sizes.elbow))
 
     def sway_torso(self, t: np.ndarray) -> np.ndarray:
         """Return the sway of the torso (n, 2) [rad] about x and y, in either order."""
