@@ -45,7 +45,7 @@ def motion(body: BodyModel, n: int, seed: int, off_deg: float, reach: float = 0.
     low, high = body.pin.lowerPositionLimit[at], body.pin.upperPositionLimit[at]
     swing = np.sin(np.outer(t, rng.uniform(1.0, 3.0, 4)) + rng.uniform(0.0, 6.0, 4))
     q[:, at] = (low + high) / 2.0 + reach * (high - low) / 2.0 * swing
-    first = body.pin.idx_qs[body.joints["LeftUpperArm"]]
+    first = body.pin.idx_qs[body.pin.getJointId("LeftUpperArm")]
     q[:, first : first + 4] = Rotation.from_rotvec(np.sin(np.outer(t, [1.0, 1.3, 0.7]))).as_quat()
     R_WL, _ = compute_link_poses(body, q, ["torso", *ARM])
     quat_WL = {name: Rotation.from_matrix(R_WL[:, k]).as_quat() for k, name in enumerate(["torso", *ARM])}
@@ -64,7 +64,7 @@ def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool) -
     quat_WL = motion(body, 40, 1, 15.0, reach=1.3)
     solution = solve_configuration(body, quat_WL, limits=limits)
     model, at = body.pin, places(body.pin)
-    first = model.idx_vs[body.joints["LeftUpperArm"]]
+    first = model.idx_vs[model.getJointId("LeftUpperArm")]
     columns = [*range(first, first + 3), *(model.idx_vs[model.getJointId(name)] for name in HINGES)]
     for k in (0, 7, 13, 26, 39):
         target = {name: quat[k] for name, quat in quat_WL.items()}

@@ -20,11 +20,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 def asset(folder: str, name: str) -> Path:
     """Path of `name` in ``urdf/`` or ``calibration/``."""
-    for root in (_PACKAGE.parent, _PACKAGE / "_assets"):
-        path = root / folder / name
-        if path.is_file():
-            return path
-    raise FileNotFoundError(f"wepose_pin was installed without {folder}/{name}; install it again")
+    path = _PACKAGE.parent / folder / name
+    return path if path.is_file() else _PACKAGE / "_assets" / folder / name
 
 
 @cache

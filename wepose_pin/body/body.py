@@ -33,9 +33,8 @@ class BodyModel:
     pin : the Pinocchio model; one frame a link, of the link's name. Its universe is W
     robot : the parsed URDF it was built from, already with its lengths and the table's names (yourdfpy)
     table : what there is on it; its links bear the names of segments and points
-    joints : child link of a spherical joint → its Pinocchio joint
-    axes : the same → (3, 3) the axes that were joined, a row each, in the joint's frame at zero; without an entry for
-        a `floating` joint
+    axes : spherical joint, which has the name of the link it moves → (3, 3) the axes that were joined, a row each, in
+        the joint's frame at zero; without an entry for a `floating` joint
     chains : segment → the joints that set its orientation, by Pinocchio's numbers, from the root outwards, in the order
         of these. A segment of a limb is set by the joints nearest to it, as many as make three axes; others above (a
         clavicle) rest. One of the spine is set by all joints between it and the segment above. There are none where it
@@ -49,7 +48,6 @@ class BodyModel:
     pin: pin.Model
     robot: Any
     table: BodyTable
-    joints: Mapping[str, int]
     axes: Mapping[str, np.ndarray]
     chains: Mapping[str, tuple[int, ...]]
     parents: Mapping[str, str | None]
@@ -280,5 +278,5 @@ _load_packaged_body = lru_cache(_load_body)  # read once; a `BodyModel` does not
 
 
 def _build_body(robot: Any, table: BodyTable, where: str) -> BodyModel:
-    model, joints, axes = build(robot, where, spherical=not table.is_mechanism)
-    return BodyModel(model, robot, table, joints, axes, *_find_chains(model, table))
+    model, axes = build(robot, where, spherical=not table.is_mechanism)
+    return BodyModel(model, robot, table, axes, *_find_chains(model, table))

@@ -100,7 +100,7 @@ def compute_start_configuration(
     for link, axes in model.axes.items():  # three joints that are one spherical joint
         angles = np.array([[values.get(joint.name, 0.0)] for joint in tree.path(link)[-3:]])
         first, second, third = Rotation.from_rotvec(angles * axes)
-        at = m.idx_qs[model.joints[link]]
+        at = m.idx_qs[m.getJointId(link)]
         q[at : at + 4] = (first * second * third).as_quat()
     return q
 

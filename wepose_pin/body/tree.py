@@ -191,14 +191,14 @@ def _add_links(robot: Any, added: Mapping[str, tuple[str, np.ndarray]]) -> Any:
     return robot
 
 
-def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[str, int], dict[str, np.ndarray]]:
+def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[str, np.ndarray]]:
     """Build the Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
 
-    Second and third: its spherical joints and their axes, as `BodyModel` has them. Other joints have the URDF's limits.
+    Second: the axes of its spherical joints, as `BodyModel` has them. Other joints have the URDF's limits.
     Without `spherical` triples of revolute joints stay as they are.
     """
     tree, links = parse_tree(robot, where), {link.name: link for link in robot.links}
-    model, joints, axes = pin.Model(), dict[str, int](), dict[str, np.ndarray]()
+    model, axes = pin.Model(), dict[str, np.ndarray]()
     model.name = robot.name or "body"
 
     def carry(link: str, parent: int, M_JL: pin.SE3) -> None:
@@ -228,18 +228,18 @@ def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[s
             else:
                 for joint in triple[1:]:
                     M_Jc = M_Jc * pin.SE3(joint.origin)
-                joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
+                joined = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
                 if own_axes is not None:
                     axes[child] = own_axes
                 # The links between the axes, as they stand at zero.
                 M_cK = pin.SE3.Identity()
                 for joint in triple[:0:-1]:
                     M_cK = M_cK * pin.SE3(joint.origin).inverse()
-                    carry(joint.parent, joints[child], M_cK)
-                grow(child, joints[child], pin.SE3.Identity())
+                    carry(joint.parent, joined, M_cK)
+                grow(child, joined, pin.SE3.Identity())
 
     grow(tree.root, 0, pin.SE3.Identity())
-    return model, joints, axes
+    return model, axes
 
 
 def joint_axis(joint: Any) -> np.ndarray:

@@ -284,17 +284,12 @@ def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
 
 def _format_joint_trajectory(trajectory: Trajectory) -> str:
     """ROS 2's trajectory_msgs/msg/JointTrajectory, a line a point."""
+    states = trajectory.joint_position, trajectory.joint_velocity, trajectory.joint_acceleration
     points = []
-    for k, time in enumerate(trajectory.time.tolist()):
-        seconds, nanoseconds = divmod(round(1e9 * time), 10**9)
-        point = {
-            "positions": np.round(trajectory.joint_position[k], DIGITS).tolist(),
-            "velocities": np.round(trajectory.joint_velocity[k], DIGITS).tolist(),
-            "accelerations": np.round(trajectory.joint_acceleration[k], DIGITS).tolist(),
-            "effort": [],
-            "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
-        }
-        points.append(json.dumps(point))
+    for time, *state in zip(trajectory.time.tolist(), *(np.round(x, DIGITS).tolist() for x in states), strict=True):
+        moment = dict(zip(("sec", "nanosec"), divmod(round(1e9 * time), 10**9), strict=True))
+        point = dict(zip(("positions", "velocities", "accelerations"), state, strict=True))
+        points.append(json.dumps(point | {"effort": [], "time_from_start": moment}))
     head = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     lines = ",\n".join(points)
     return (

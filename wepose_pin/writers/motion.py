@@ -290,7 +290,8 @@ def convert_person(motion: TrackResult) -> JointMotion:
     check_complete(motion, "a file of joints")
     motion = resample_evenly(motion)
     model, pose = motion.model, motion.pose
-    if free := [child for child in model.joints if child not in model.axes]:
+    spherical = [name for name, size in zip(model.pin.names, model.pin.nvs, strict=True) if size == 3]
+    if free := [child for child in spherical if child not in model.axes]:
         raise BadData(f"{motion.where}: link '{free[0]}' hangs on a joint of type floating, which has no axes to state")
     q = solve_configuration(model, pose.quat_WL) if pose.q is None else pose.q
     values = compute_joint_values(model.pin, q)
@@ -312,7 +313,7 @@ def convert_person(motion: TrackResult) -> JointMotion:
 
 def _split_triple(model: BodyModel, child: str, q: np.ndarray) -> dict[str, np.ndarray]:
     """Compute the angles (n,) [rad] of the three revolute joints that are one spherical joint of the model."""
-    first, axes = model.pin.idx_qs[model.joints[child]], model.axes[child]
+    first, axes = model.pin.idx_qs[model.pin.getJointId(child)], model.axes[child]
     last = -1.0 if np.linalg.det(axes) < 0.0 else 1.0  # mirrored axes
     basis = axes * [[1.0], [1.0], [last]]
     # R = exp(a1 q1) exp(a2 q2) exp(a3 q3), in coordinates along the axes Rx Ry Rz.
