@@ -136,7 +136,7 @@ ProtocolName = Annotated[str, Parameter(metavar="NAME|FILE.toml"), _checked_by("
 Robot = Annotated[str, Parameter(metavar="NAME|FILE")]
 Speed = Annotated[str, Parameter(metavar="FACTOR")]
 RobotName = Annotated[str, Parameter(metavar="NAME|FILE"), _checked_by("retargeting:find_map")]
-RobotHz = Annotated[float, Parameter(metavar="HZ"), _checked_by("retargeting.trajectory:check_rate")]
+RobotHz = Annotated[Hz, Parameter(validator=validators.Number(gte=10, lte=2000))]
 ExportHz = Annotated[float, Parameter(metavar="HZ"), _checked_by("writers.motion:check_rate")]
 if TYPE_CHECKING:
     Measured = Mapping[str, float]

@@ -11,18 +11,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..arguments import check_arguments
+from ..arguments import Range, check_arguments
 from ..body import BodyTable
 from ..body.kinematics import Pose, find_samples
 from ..body.urdf import read_urdf, resolve_meshes
-from ..errors import BadOption, WrongOption
+from ..errors import BadOption
 from ..recording import select_interval
 from ..tracking import TrackResult
 from ..writers import load_result, select_pose
@@ -113,7 +113,7 @@ def retarget(
     *,
     arm: Literal["left", "right", "both"] | None = None,
     task: Literal["both", "position", "orientation"] = "both",
-    rate_hz: float = RATE_HZ,
+    rate_hz: Annotated[float, Range(10.0, closed=True, high=2000.0, unit="Hz")] = RATE_HZ,
     scale: float | None = None,
     smoothing_hz: float = SMOOTHING_HZ,
     speed_scale: float | None = None,
@@ -178,7 +178,6 @@ def retarget(
     True
     """
     check_arguments(retarget, locals())
-    check_rate(rate_hz)
     motion = load_result(pose) if isinstance(pose, str | Path) else pose
     if isinstance(motion, TrackResult):
         table, motion = table or motion.model.table, select_pose(motion, interval, phase)
@@ -235,12 +234,6 @@ def _compute_trajectory(
         slowest=slowest,
         **run,
     )
-
-
-def check_rate(rate_hz: float) -> None:
-    """Raise `WrongOption` for a rate out of range."""
-    if not 10.0 <= rate_hz <= 2000.0:
-        raise WrongOption("rate-hz", f"{rate_hz:g}", "from 10 to 2000 samples a second")
 
 
 def _run_controller(
