@@ -15,7 +15,7 @@ from xml.sax.saxutils import escape, unescape
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import BadModel, MissingFile
+from ..errors import BadModel, MissingFile, reason
 
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 
@@ -32,10 +32,8 @@ def read_urdf(path: Path) -> Any:
     try:
         robot = import_yourdfpy().URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        if isinstance(error, KeyError):
-            reason = f"an element lacks the attribute {reason}"
-        raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
+        cause = f"an element lacks the attribute {error}" if isinstance(error, KeyError) else reason(error)
+        raise BadModel(f"{path}: cannot be read as a URDF: {cause}") from error
     shapes = [shape for link in robot.links for shape in (*link.visuals, *link.collisions)]
     for shape in shapes:
         mesh = None if shape.geometry is None else shape.geometry.mesh
