@@ -65,7 +65,7 @@ def configurations(text: str, body: BodyModel, rng: np.random.Generator) -> tupl
     q = pin.neutral(body.pin)
     for k, name in enumerate(body.pin.names):
         first = body.pin.idx_qs[k]
-        if name not in body.joints:
+        if name not in body.axes:
             if k:
                 there = raw.idx_qs[raw.getJointId(name)]
                 q[first : first + body.pin.nqs[k]] = q_raw[there : there + body.pin.nqs[k]]
@@ -178,7 +178,7 @@ def test_one_length_leaves_the_others_and_the_directions_alone(urdf: Path) -> No
 def test_a_longer_segment_is_heavier_by_its_volume() -> None:
     body = load_model()
     longer = body.with_lengths({"left_upper_arm": 1.5 * body.lengths["left_upper_arm"]})
-    before, after = (each.pin.inertias[body.joints["left_upper_arm"]] for each in (body, longer))
+    before, after = (each.pin.inertias[each.pin.getJointId("left_upper_arm")] for each in (body, longer))
     assert after.mass == pytest.approx(1.5 * before.mass)
     np.testing.assert_allclose(after.lever, before.lever * [1.0, 1.0, 1.5])
 
@@ -282,7 +282,7 @@ def test_three_orthogonal_axes_in_any_order_are_one_spherical_joint(
     text = small(elbow=triple("left_upper_arm", "left_forearm", "0 0 -0.3", axes, rpy))
     file = written(tmp_path, text)
     body = load_model(file)
-    assert "left_forearm" in body.joints
+    assert "left_forearm" in body.axes
     worst, _ = largest_difference(text, body)
     assert worst < 1e-12
     # Each axis, turned alone, is the rotation about the axis that the body states.
@@ -393,7 +393,7 @@ def test_a_table_is_given_or_lies_beside_its_urdf(tmp_path: Path) -> None:
     plain = load_model(written(tmp_path, small(), "plain.urdf"))
     for body in (by_table, model):
         assert body.lengths == pytest.approx(plain.lengths, abs=1e-12)
-        assert set(body.joints) == {OTHER.get(name, name) for name in plain.joints}
+        assert set(body.axes) == {OTHER.get(name, name) for name in plain.axes}
     again = load_model(written(tmp_path, model.urdf(), "again.urdf"))  # beside a table for another file
     assert again.lengths == pytest.approx(plain.lengths, abs=1e-12)
 
