@@ -6,9 +6,6 @@ Pelvis, hip and ankle: Wu et al. 2002, Part I of the same, Journal of Biomechani
 10.1016/S0021-9290(01)00222-6. Knee: Grood and Suntay 1983, "A joint coordinate system for the clinical description of
 three-dimensional motions: application to the knee", Journal of Biomechanical Engineering 105:136–144, doi
 10.1115/1.3138397.
-
-`euler` takes rotations apart and follows the angles over time; `joints` says which segments make a joint, in which
-axes and sequence, and carries the uncertainty; `movement` gives ranges, rates and tables.
 """
 
 from .joints import AUTO as AUTO

@@ -49,11 +49,9 @@ def sequence(name: str) -> Sequence:
 def decompose(quat: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Take rotations (n, 4) apart: return their angles (n, 3) and how far they are from gimbal lock (n,) [rad].
 
-    First and third are in (−π, π], the second in [−π, 0] or, of three axes, [−π/2, π/2].
-
-    A proper sequence's second angle is negative, as the ISB has the elevation of the arm. In the lock, where only the
-    sum or the difference of first and third is defined, the first is held from the sample before (at the beginning,
-    taken from the next one that has it; else zero).
+    First and third are in (−π, π], the second in [−π, 0], as the ISB has the elevation of the arm, or, of three axes,
+    in [−π/2, π/2]. In the lock, where only the sum or the difference of first and third is defined, the first is held
+    from the sample before (at the beginning, taken from the next one that has it; else zero).
     """
     s = sequence(name)
     w, qi, qj, qk = quat[:, 3], quat[:, s.i], quat[:, s.j], quat[:, s.k]

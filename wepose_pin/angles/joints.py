@@ -140,8 +140,7 @@ def diagnose_lock(angles: Angles) -> list[Diagnostic]:
         share = float(np.mean(joint.near_lock))
         if share > MAX_NEAR_LOCK:
             facts = {"first": joint.names[0], "third": joint.names[2]}
-            if joint.sequence == "YXY":
-                facts["variant"] = "hanging"
+            facts |= {"variant": "hanging"} if joint.sequence == "YXY" else {}
             diagnostics.append(Diagnostic("angles-near-lock", INFO, name, share, MAX_NEAR_LOCK, facts))
     return diagnostics
 
@@ -247,10 +246,9 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
         rows = _gradients(values, joint.sequence, quat_WP, left)
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
-        std = np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
+        std = _expand(known, np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN))
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
     gimbal, values, quat = (_expand(known, each) for each in (gimbal, values, rotations.unwrap_signs(quat)))
-    std = None if std is None else _expand(known, std)
     return JointAngles(joint.sequence, joint.names, values, gimbal, gimbal < NEAR_LOCK, gap, std, quat)
 
 

@@ -26,9 +26,7 @@ from .repetitions import PERCENT, MeanCurve, Repetitions, compute_mean_curves, f
 # and a sine of 2 Hz reads 1.6% low, one of 5 Hz 10%.
 RATE_WINDOW_S = 0.05
 MEASURES = {"lowest": "deg", "highest": "deg", "range": "deg", "peak_rate": "deg_s"}  # units in a file
-# A longer time step than this many usual ones ends a run: the samples on its two sides are filtered apart.
-_LONGEST_STEP = 1.5
-_SHORTEST_RUN = 10  # samples; a shorter run is not filtered
+_SHORTEST_RUN = 10  # samples; a shorter run is not low-passed
 
 
 @dataclass(frozen=True)
@@ -94,18 +92,12 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
     step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 1.0
     if not 0.0 < cutoff_hz < 0.45 / step:
         raise WrongOption("low-pass-hz", f"{cutoff_hz:g}", f"above 0 and below {0.45 / step:.3g} Hz is needed here")
-    gaps = 1 + np.flatnonzero(np.diff(pose.time) >= _LONGEST_STEP * step)
-    quat_WL = {}
-    for segment, quat in pose.quat_WL.items():
-        smooth = quat.copy()
-        known = np.isfinite(quat).all(axis=1)
-        for start, stop in zip([0, *gaps], [*gaps, len(quat)], strict=True):
-            for a, b in find_runs(known[start:stop]):
-                run = slice(start + a, start + b)
-                if b - a >= _SHORTEST_RUN:
-                    filtered = low_pass(unwrap_signs(quat[run]), cutoff_hz, 1.0 / step)
-                    smooth[run] = filtered / np.linalg.norm(filtered, axis=1, keepdims=True)
-        quat_WL[segment] = smooth
+    quat_WL = {segment: quat.copy() for segment, quat in pose.quat_WL.items()}
+    for quat in quat_WL.values():
+        for a, b in find_runs(np.isfinite(quat).all(axis=1)):
+            if b - a >= _SHORTEST_RUN:
+                filtered = low_pass(unwrap_signs(quat[a:b]), cutoff_hz, 1.0 / step)
+                quat[a:b] = filtered / np.linalg.norm(filtered, axis=1, keepdims=True)
     return replace(pose, quat_WL=quat_WL, q=None)
 
 
@@ -247,8 +239,8 @@ def build_tables(movements: Sequence[Movement]) -> dict[str, pl.DataFrame]:
         repetitions += [_tabulate_spans(movement, about)] if about else []
         selected = movement.angles.time[[0, -1]].tolist()
         named = [(name, *each) for name, spans in movement.phases.items() for each in enumerate(spans, 1)]
-        keys = ("phase", "number", "from_s", "to_s")
-        about = [dict(zip(keys, (name, k, *span), strict=True)) for name, k, span in [("all", 1, selected), *named]]
+        listed = [("all", 1, selected), *named]
+        about = [{"phase": name, "number": k, "from_s": a, "to_s": b} for name, k, (a, b) in listed]
         phases.append(_tabulate_spans(movement, about))
     return {
         "angles": pl.concat(angles, how="diagonal"),

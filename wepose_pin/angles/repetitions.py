@@ -73,11 +73,9 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
     """Find the repetitions of a movement: excursions of one angle, out and back.
 
     The angle is low-passed for this purpose alone. A repetition begins where it rests, at that end of its range near
-    which it spends clearly more time, else at the one nearer to zero; there the rate is at most 5 % of its peak, as is
-    usual in studies of reaching. A rest between two repetitions belongs to neither, a stop on the way belongs to the
-    repetition, and an excursion that the recording cuts is left out. So are those that are far larger or smaller than
-    the others, unlike them, or in gaps; if these are too many, the movement does not repeat. The numbers were chosen
-    with noise, rests, two speeds, cut ends and random motions, of which three in a hundred are taken for repetitions.
+    which it spends clearly more time, else at the one nearer to zero. Excursions that the recording cuts, or that are
+    far larger or smaller than the others, unlike them, or in gaps, are left out; if these are too many, the movement
+    does not repeat. Of random motions three in a hundred are taken for repetitions.
 
     Parameters
     ----------
@@ -103,10 +101,8 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
     if high - low < MIN_RANGE:
         reason = f"the angle has a range of {np.degrees(high - low):.1f}°, and {np.degrees(MIN_RANGE):.0f}° are needed"
         return none._replace(reason=reason)
-    if rising is None:
-        rising = _rests_low(signal, low, high)
-    spans = _find_spans(angles.time, signal if rising else -signal, float(high - low))
-    none = none._replace(rising=rising)
+    none = none._replace(rising=_rests_low(signal, low, high) if rising is None else rising)
+    spans = _find_spans(angles.time, signal if none.rising else -signal, float(high - low))
     if len(spans) < MIN_REPETITIONS:
         times = ("no time", "once", "twice")[len(spans)]
         return none._replace(reason=f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed")

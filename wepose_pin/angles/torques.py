@@ -1,8 +1,7 @@
 """Joint torques of a motion by inverse dynamics: estimates, from the model's inertias and a smoothed configuration.
 
 The base is fixed and nothing but gravity acts on the body: no ground, no load in the hands. Accelerations are second
-derivatives of measured orientations, so the motion is smoothed first, by a Butterworth filter of second order that runs
-forwards and backwards (no delay; the two passes together have half the amplitude at the cut-off, that is −6 dB).
+derivatives of measured orientations, so the motion is low-passed first, forwards and backwards (−6 dB at the cut-off).
 """
 
 from __future__ import annotations

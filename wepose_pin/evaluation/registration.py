@@ -180,9 +180,7 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
             cross += np.einsum("nij,nkj->ik", R_WL.as_matrix(), R_VT.as_matrix()) / len(time)
     left, sizes, right = np.linalg.svd(cross)
     if sizes[1] < 1e-6 * max(sizes[0], 1e-300):
-        raise BadData(
-            "the reference cannot be aligned: what both have moves about one axis alone in the seconds for that"
-        )
+        raise BadData("the reference cannot be aligned: in the seconds for that all segments turn about one axis alone")
     full = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     if up is None:
         up = max(AXES, key=lambda axis: float(full[2] @ AXES[axis]))

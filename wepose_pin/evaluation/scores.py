@@ -158,11 +158,9 @@ def evaluate(
     last = min(pose.time[-1], truth.time[-1], interval[1] if interval else np.inf)
     inside = (pose.time >= first - 1e-9) & (pose.time <= last + 1e-9)
     if not np.any(inside):
-        raise BadData(
-            f"pose ({format_span((pose.time[0], pose.time[-1]))}) and reference "
-            f"({format_span((truth.time[0], truth.time[-1]))}) have no time in common"
-            + (f" within the interval {format_span(interval)}" if interval else "")
-        )
+        ours, theirs = (format_span(each.time[[0, -1]]) for each in (pose, truth))
+        within = f" within the interval {format_span(interval)}" if interval else ""
+        raise BadData(f"pose ({ours}) and reference ({theirs}) have no time in common{within}")
     pose = pose.cut(inside)
     time = np.clip(pose.time, truth.time[0], truth.time[-1])
     truth = Pose(
@@ -203,9 +201,7 @@ def evaluate(
         if common and not errors:
             raise BadData(f"no {kind} is known to both at a time: of {', '.join(sorted(common))} one of the two is NaN")
     if not attitude and not position:
-        raise BadData(
-            "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
-        )
+        raise BadData("pose and reference have no segment and no point in common; columns of pose.parquet are needed")
     joints = _joint_errors(pose, truth, list(attitude))
     uncertainties = attitude_uncertainty, position_uncertainty
     span = float(truth.time[0]), float(truth.time[-1])

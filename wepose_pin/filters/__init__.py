@@ -7,10 +7,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -60,15 +59,13 @@ def check_method(method: str) -> str:
 _Records = tuple[np.ndarray, ...]
 
 
-def _bind(
+def _run(
     filter_: OrientationFilter, records: tuple[_Records, _Records], samples: Sequence[np.ndarray], out: Orientation
-) -> list[Callable[[], None]]:
-    """Return the calls of a filter's static test and of its run, which fill `out` from `samples` gyro_S, accel_S."""
+) -> None:
+    """Fill `out` by the static test and the filter from `samples` gyro_S, accel_S (n, 3), contiguous."""
     filled = (out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical)[: 4 if filter_.has_covariance else 2]
-    return [
-        partial(find_static, *records[0], *samples, out.static),
-        partial(filter_.run, *records[1], *samples, out.static, *filled),
-    ]
+    find_static(*records[0], *samples, out.static)
+    filter_.run(*records[1], *samples, out.static, *filled)
 
 
 class SensorFilters:
@@ -110,7 +107,7 @@ class SensorFilters:
         self._records: dict[str, tuple[_Records, _Records]] = {}  # of the static test and of the filter
         k = len(self.names)
         self._now = make_orientation(k, TYPICAL, covariance=METHODS[method].has_covariance)
-        self._gyro_S, self._accel_S = np.empty((k, 3)), np.empty((k, 3))  # of a step
+        self._rows = [self._now.take(slice(i, i + 1)) for i in range(k)]  # of each sensor
         self.quat_VS, self.gyro_bias, self.static, self.attitude_cov = self._now[:4]
         self.about_vertical = self._now.about_vertical
 
@@ -138,19 +135,11 @@ class SensorFilters:
         """
         if np.shape(gyro_S) != self.gyro_bias.shape or np.shape(accel_S) != self.gyro_bias.shape:
             raise BadData(f"gyro_S {np.shape(gyro_S)} and accel_S {np.shape(accel_S)}: {len(self.names)} rows of three")
-        self._gyro_S[:], self._accel_S[:] = gyro_S, accel_S
-        for call in self._calls:
-            call()
-        return self.quat_VS
-
-    @cached_property
-    def _calls(self) -> list[Callable[[], None]]:
-        """What a step calls, on arrays that stay: to prepare arguments takes longer than to filter a sample."""
-        calls: list[Callable[[], None]] = []
+        filter_ = METHODS[self._method]
+        gyro_S, accel_S = (np.ascontiguousarray(each, dtype=float) for each in (gyro_S, accel_S))
         for i, name in enumerate(self.names):
-            gyro_S, accel_S, now = self._gyro_S[i : i + 1], self._accel_S[i : i + 1], self._now.take(slice(i, i + 1))
-            calls += _bind(METHODS[self._method], self._records[name], (gyro_S, accel_S), now)
-        return calls
+            _run(filter_, self._records[name], (gyro_S[i : i + 1], accel_S[i : i + 1]), self._rows[i])
+        return self.quat_VS
 
     def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
         """Filter a chunk of one sensor."""
@@ -164,9 +153,7 @@ class SensorFilters:
             begin = self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range, out)
         if self._method in OFFLINE and out.attitude_cov is not None:  # forward over all samples
             begin, cov = 0, out.attitude_cov[:begin].copy()
-        rest = out.take(slice(begin, None))
-        for call in _bind(filter_, self._records[name], (gyro_S[begin:], accel_S[begin:]), rest):
-            call()
+        _run(filter_, self._records[name], (gyro_S[begin:], accel_S[begin:]), out.take(slice(begin, None)))
         if cov is not None and out.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
             out.attitude_cov[: len(cov)] = cov
@@ -195,8 +182,7 @@ class SensorFilters:
             records = static, backward.make_records(mirrored, rate_hz, start, params)
             run = make_orientation(first, mirrored, covariance=backward.has_covariance)
             samples = [np.ascontiguousarray(each) for each in (-gyro_S[first:0:-1], accel_S[first - 1 :: -1])]
-            for call in _bind(backward, records, samples, run):
-                call()
+            _run(backward, records, samples, run)
             for field, values in run.sampled().items():
                 getattr(out, field)[:first] = values[::-1]
             out.gyro_bias[:first] *= -1.0

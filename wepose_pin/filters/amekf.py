@@ -412,9 +412,7 @@ def make_records(
     return state, model
 
 
-# While gyro is lost the last rate is held and fades, and the attitude's covariance grows by what may have been missed
-# (`base.HOLD_S`), as at a sample beyond the range in `params`. A lost sample of accel counts as gravity alone, and the
-# velocity's covariance grows. An impact (`AmekfParams.impact`) increases it too. A jump of the bias is adopted in the
-# next static phase; until then the tilt error reaches some degrees. Without a static phase everything is estimated in
-# motion: the tilt in ten seconds, the other parameters in about a minute.
+# A lost sample of accel counts as gravity alone, and the velocity's covariance grows. A jump of the bias is adopted in
+# the next static phase; until then the tilt error reaches some degrees. Without a static phase everything is estimated
+# in motion: the tilt in ten seconds, the other parameters in about a minute.
 AMEKF = base.OrientationFilter(lambda *of_sensor: (*make_records(*of_sensor), np.empty(0, BLOCK)), run, AmekfParams)

@@ -191,7 +191,6 @@ def _make_records(
     return state, model
 
 
-# While gyro is lost, its last rate is held and fades, and `attitude_cov` grows by the motion that may have been missed.
 SMEKF = base.OrientationFilter(_make_records, _run, SmekfParams)
 
 

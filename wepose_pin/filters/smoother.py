@@ -6,9 +6,8 @@ on. The backward pass is that of Rauch, Tung and Striebel 1965 (AIAA Journal 3(8
 
     λ ← (I − K h)ᵀ λ − h y/s,  Λ ← (I − K h)ᵀ Λ (I − K h) + h hᵀ/s  for each measurement, and  λ ← Fᵀ λ,  Λ ← Fᵀ Λ F
 
-for each block, which inverts nothing. It goes from block to block of the filter; the samples in between take the
-corrections of both ends in proportion. Time is linear in the samples; the blocks between the passes take
-3.5 kB a block, that is 140 bytes a sample at 100 Hz, 14 at 1 kHz, beside the output's 160.
+for each block, which inverts nothing. It goes from block to block of the filter (3.5 kB each); the samples in between
+take the corrections of both ends in proportion.
 """
 
 from __future__ import annotations
@@ -136,5 +135,4 @@ def _smooth(states: np.ndarray, models: np.ndarray, *arrays: np.ndarray) -> None
     _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, static, *out)
 
 
-# What bad data does is said at `AMEKF`; a stretch without gyro is bridged from both sides.
 SMOOTHER = OrientationFilter(make_records, _smooth, AmekfParams)

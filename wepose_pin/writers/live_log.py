@@ -45,10 +45,7 @@ class LiveLog:
         self._file: BinaryIO | None = None
         if path is not None:
             check_absent(path, force)
-            try:
-                self._file = path.open("wb")
-            except OSError as error:
-                raise ExistingOutput(f"{path}: cannot be written: {error.strerror}") from error
+            self._file = path.open("wb")
         self.path, self.problem = path, ""
         self._sensors = list(header["sensors"])
         self._measured = [name in header["orientations"] for name in self._sensors]

@@ -101,8 +101,8 @@ def find_measured_points(motion: TrackResult) -> dict[str, np.ndarray]:
     """Point → (n, 3) [m] in W, NaN where a segment on its way from the root was bridged; `BadData`: none is known."""
     pose = motion.pose
     if not pose.points:
-        lacking = f"for lack of a sensor on the {motion.model.table.reference}"
-        raise BadData(f"{motion.where}: no points in pose.parquet, {lacking}")
+        reference = motion.model.table.reference
+        raise BadData(f"{motion.where}: no points in pose.parquet, for lack of a sensor on the {reference}")
     points = {}
     for point, p_W in pose.points.items():
         lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]
