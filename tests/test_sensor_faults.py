@@ -94,6 +94,14 @@ def test_a_dead_axis_is_refused_by_name_of_files_and_of_arrays(dead: str, made: 
             values[dead.split()[0]][:, 1 if dead.endswith("y") else slice(None)] = 0.0
         pairs[name] = tuple(values.values())
     files = with_sensor(recording, BROKEN, gyro_S=pairs[BROKEN][0], accel_S=pairs[BROKEN][1])
+    if dead != "gyro":  # from a moment on it is lost
+        key = f"{dead.split()[0]}_S"
+        values = getattr(recording.sensors[BROKEN], key).copy()
+        values[recording.time >= 9.0, 1] = 0.0
+        later = load_session(written(tmp_path / "later", with_sensor(recording, BROKEN, **{key: values})))
+        (frozen,) = (each for each in later.diagnostics if each.code == "sensor-frozen")
+        assert (frozen.place, frozen.facts["signals"]) == (BROKEN, dead)
+        assert frozen.facts["start"] == pytest.approx(9.0, abs=0.011)
     text = f"{dead} stands still at 0"
     with pytest.raises(WeposeError, match=f"sensors.{BROKEN}: {text}"):
         load_session(written(tmp_path / "in", files))

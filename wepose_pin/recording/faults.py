@@ -2,7 +2,7 @@
 
 A repeated value alone is no fault: a coarse sensor on a table repeats for minutes, and so do data without noise. It is
 one where the signal is noisy and repeats much longer than otherwise, or all along while another signal is noisy. So is
-a single axis that never changes while the sensor moves and the other two have noise of more than a digit.
+a single axis that never changes (again) while the sensor moves and the other two have noise of more than a digit.
 Files and live streams (`arrivals`) share what tells noise and saturation.
 """
 
@@ -23,6 +23,7 @@ from .limits import NARROWEST_GYRO_RANGE
 # Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5
 STUCK_S = 1.0  # [s] the same for rate or force alone
+DEAD_S, DEAD_ROWS = 5.0, 100  # shortest constant end of one axis that counts as dead, and its least samples
 MOST_REPEATS = 4.0  # times as long as it repeats otherwise
 COARSE = 1e-4  # share of runs of equal rows above so many times the usual length from which the digits are coarse
 # Noise reverses dozens of times a second; smooth motion hardly does.
@@ -130,14 +131,10 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         own, covered, moves = list[Fault](), np.zeros(len(time), dtype=bool), accel_S.std(axis=0).max() > MOVING
         before = float(np.nextafter(time[0], -np.inf))  # the first sample is faulty, too
         for signals, signal in ((GYRO, gyro_S), (ACCEL, accel_S)):
-            dead = np.flatnonzero((signal == signal[0]).all(axis=0))
-            if len(dead) == 1 and moves:
-                steps = np.abs(np.diff(signal, axis=0))
-                digit = steps.min(axis=0, where=steps > 0.0, initial=np.inf)
-                # Noise below a digit turns by single digits: then an axis that hardly moves stands, too.
-                if _is_noisy(time, signal * np.minimum(1.0, np.sqrt(ROUNDING_TURN / 1.5) / digit)):
-                    value = (float(signal[0, dead[0]]),)
-                    own.append(Fault(f"{signals} {'xyz'[dead[0]]}", before, float(time[-1]), value))
+            if (dead := _find_dead_axis(time, signal, accel_S)) is not None:
+                axis, row = dead
+                begin = float(time[row]) if row else before
+                own.append(Fault(f"{signals} {'xyz'[axis]}", begin, float(time[-1]), (float(signal[-1, axis]),)))
         of_gyro, of_accel = _mark_repeats(gyro_S), _mark_repeats(accel_S)
         for signals, columns, repeats, least_s in (
             (BOTH, (gyro_S, accel_S), of_gyro & of_accel, FROZEN_S),
@@ -172,6 +169,23 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     return faults
 
 
+def _find_dead_axis(time: np.ndarray, signal: np.ndarray, accel_S: np.ndarray) -> tuple[int, int] | None:
+    """Find an axis of a signal (n, 3) that never changes from a row on, while the sensor moves; return both."""
+    differs = np.vstack([np.ones(3, dtype=bool), signal[:-1] != signal[-1]])
+    begins = len(time) - 1 - np.argmax(differs[::-1], axis=0)  # rows from which the axes have their last values
+    axis, row = int(np.argmin(begins)), int(begins.min())
+    changes = np.flatnonzero(np.diff(signal[:row, axis], prepend=np.nan))
+    repeats = np.diff(changes, append=row).max(initial=1)  # rows of its longest run before
+    is_long = row == 0 or (time[-1] - time[row] >= DEAD_S and len(time) - row > MOST_REPEATS * repeats)
+    if not is_long or np.count_nonzero(begins == row) > 1 or accel_S[row:].std(axis=0).max() <= MOVING:
+        return None
+    steps = np.abs(np.diff(signal[row:], axis=0))
+    digit = steps.min(axis=0, where=steps > 0.0, initial=np.inf)
+    # Noise below a digit turns by single digits: then an axis that hardly moves stands, too.
+    is_noisy = _is_noisy(time[row:], signal[row:] * np.minimum(1.0, np.sqrt(ROUNDING_TURN / 1.5) / digit))
+    return (axis, row) if is_noisy else None
+
+
 def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
     """Mark the rows (n,) in which all signals (n, 3) repeat the row before."""
     changes = np.logical_or.reduce([signal[1:] != signal[:-1] for signal in signals]).any(axis=1)
@@ -180,9 +194,11 @@ def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
 
 @kernel
 def _may_have_faults(values):  # type: ignore[no-untyped-def]
-    """Return whether an axis ends as it begins, or `FROZEN_SAMPLES` rows (3,) in a row are the same: few signals do."""
+    """Return whether an axis may be dead at the end, or `FROZEN_SAMPLES` rows (3,) are the same: few signals do."""
+    end = len(values) - 1
+    middle, begin = max(0, end - DEAD_ROWS // 2), max(0, end - DEAD_ROWS)
     for k in range(3):
-        if len(values) > 1 and values[0, k] == values[-1, k]:
+        if end > 0 and values[begin, k] == values[middle, k] == values[end, k]:
             return True
     repeats = 0
     for row in range(1, len(values)):
