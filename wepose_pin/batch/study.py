@@ -31,8 +31,7 @@ from ..commands.options import parse
 from ..documents import whole_file
 from ..errors import BadData, BadOption, ExistingOutput, LostWorker, WeposeError, reason
 from ..filters.base import count_processors
-from ..writers.provenance import code, file_hashes, list_named_files
-from ..writers.result import as_json
+from ..writers.result import as_json, code, file_hashes, list_named_files
 from .plan import STEPS, Item, is_remote, open_filesystem, read_plan, write_words
 
 DONE_FILE = "done.json"  # written last: an item's folder without it is not complete

@@ -67,8 +67,7 @@ def calibrate(
     from ..readers import load_session
     from ..report import calibration as report_room
     from ..report.page import write_pages
-    from ..writers.provenance import collect_provenance, result_folder
-    from ..writers.result import write_calibration
+    from ..writers.result import collect_provenance, result_folder, write_calibration
 
     if prior is not None and (stature is not None or sex is not None):
         needed = "has the lengths of a person; --stature and --sex narrow those of the population"

@@ -264,7 +264,7 @@ def angles(
     from ..report import angles as report
     from ..report.page import write_pages
     from ..writers import load_result, select_pose
-    from ..writers.provenance import collect_provenance, write_provenance
+    from ..writers.result import collect_provenance, write_provenance
 
     if main_angle is not None and repetitions is not None:
         raise BadOption(f"--main-angle {main_angle} finds repetitions, and --repetitions {repetitions} marks them")

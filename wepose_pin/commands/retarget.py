@@ -67,8 +67,7 @@ def retarget(
     from ..retargeting.trajectory import STAGES
     from ..writers import load_result, select_pose
     from ..writers.motion import REPETITIONS
-    from ..writers.provenance import collect_provenance
-    from ..writers.result import as_json
+    from ..writers.result import as_json, collect_provenance
 
     names = ("robot", "arm", "task", "rate_hz", "scale", "smoothing_hz", "speed_scale", "limit_margin")
     chosen: dict[str, Any] = {name: options[name] for name in names}

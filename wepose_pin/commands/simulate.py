@@ -79,7 +79,7 @@ def simulate(
     from ..body.subject import mount_rows, subject_toml
     from ..documents import whole_folder
     from ..writers import write_session
-    from ..writers.provenance import collect_provenance, write_provenance
+    from ..writers.result import collect_provenance, write_provenance
 
     if activity is not None and protocol is not None:
         raise BadOption(f"--activity {activity} with --protocol {protocol}: one of them; leave one out")

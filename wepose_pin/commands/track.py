@@ -70,8 +70,7 @@ def track(
     from ..report.page import PAGES
     from ..report.pages import write_track_pages
     from ..tracking import CHUNK_S, Tracker, TrackSummary, track_chunks
-    from ..writers.provenance import collect_provenance, result_folder
-    from ..writers.result import write_about, write_poses
+    from ..writers.result import collect_provenance, result_folder, write_about, write_poses
 
     chosen = method or BEST
     with progress_bar() as progress, result_folder(out, force, PAGES) as folder:

@@ -36,8 +36,7 @@ from ..recording.arrivals import Samples, Ticks
 from ..report.calibration import render_calibration_report
 from ..report.page import write_pages
 from ..simulation import simulate
-from ..writers.provenance import collect_provenance, result_folder
-from ..writers.result import write_calibration
+from ..writers.result import collect_provenance, result_folder, write_calibration
 from .setup import AssignedSource, SensorSetup, rename_sensors, write_segments
 from .sources import Source
 from .state import Action, GuideView, LivePose, Output, SensorStatus, Stage, Status, StreamInfo, join_names

@@ -20,8 +20,7 @@ from ..documents import whole_file
 from ..errors import reason
 from ..tracking import TrackResult, TrackSummary, summarize
 from ..tracking.summary import find_samples_after_start, finite_median, measure_reach
-from ..writers.provenance import CALL, collect_provenance, result_folder
-from ..writers.result import write_about, write_poses
+from ..writers.result import CALL, collect_provenance, result_folder, write_about, write_poses
 from .page import PAGES, write_pages
 from .viewer import FRAMES_A_SECOND, compute_angles, pose_html
 from .words import explain_no_covariance, listed, name_tips, plain
