@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin import ImuSensor, OrientationSensor, Recording, Simulation, Subject, simulate, simulate_person, track
 from wepose_pin.body.subject import Hinge
+from wepose_pin.rotations import heading
 from wepose_pin.tracking import Tracker
 
 HINGES = {joint: Hinge(np.array([0.0, 1.0, 0.0]), np.deg2rad(2.0)) for joint in ("left_elbow", "right_elbow")}
@@ -260,6 +261,37 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
         std = np.sqrt(np.interp(rows, correction.time, correction.covariance @ signs @ signs))
         by_std = errors[pair] / np.degrees(std)
         assert np.sqrt(np.mean(by_std**2)) < 1.6
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("lost", ["left_forearm", "right_upper_arm"])
+def test_a_sensor_that_is_lost_while_the_person_turns_is_found_again(
+    moving: Simulation, lost: str, causal: bool
+) -> None:
+    """Until then its stated uncertainty covers the turn, and a warning names its joints."""
+    begin, turn = 30.0, np.pi
+    end = begin + turn / np.deg2rad(90.0)
+    recording, up = moving.recording(), [0.0, 0.0, 1.0]
+    gap, sensors = (recording.time > begin) & (recording.time <= end), dict[str, ImuSensor]()
+    for name, sensor in recording.imus.items():
+        turning_S = np.deg2rad(90.0) * Rotation.from_quat(moving.quat_WS[name]).inv().apply(up)
+        gyro_S = np.where(gap[:, None], sensor.gyro_S + turning_S, sensor.gyro_S)
+        sensors[name] = replace(sensor, gyro_S=gyro_S, gap=gap if name == lost else None)
+    phases = {"start": recording.phases["start"]}
+    tracked = track(replace(recording, sensors=sensors, phases=phases), causal=causal)
+    truth = Rotation.from_quat(moving.quat_WL[lost][np.searchsorted(moving.time, tracked.time - 1e-9)])
+    turned = np.clip(tracked.time - begin, 0.0, end - begin)[:, None] * np.deg2rad(90.0) * up
+    error = (Rotation.from_rotvec(turned) * truth * Rotation.from_quat(tracked.quat_WL[lost]).inv()).as_quat()
+    after = tracked.time > end
+    error_deg, std = np.degrees(np.abs(heading(error)))[after], np.sqrt(tracked.pose.segment_cov[lost][after, 2, 2])
+    assert np.all(error_deg < 3.0 * np.degrees(std))
+    assert np.all(error_deg[-1500:] < 15.0)
+    if causal:
+        assert error_deg.max() > 120.0
+        uncertain = [each.place for each in tracked.diagnostics if each.code == "heading-uncertain"]
+        assert tracked.model.table.joint_name(lost) in uncertain
+    else:
+        assert error_deg.max() < 20.0
 
 
 @pytest.mark.parametrize("causal", [False, True])

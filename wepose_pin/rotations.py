@@ -105,6 +105,11 @@ def heading(quat_WV: ArrayLike) -> np.ndarray:
     return np.angle(np.exp(2j * np.arctan2(quat[..., 2], quat[..., 3])))
 
 
+def wrap_angle(angle: np.ndarray) -> np.ndarray:
+    """Return angles [rad] within half a turn."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
 def unwrap_signs(quat: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """The same rotations (n, 4) with signs by which neighbours lie on one side, and the first with `before` (4,)."""
     jumps = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))

@@ -26,6 +26,7 @@ from ..body.tree import UNIVERSE
 from ..filters.butterworth import band_pass
 from ..observations import BAND_HZ, LEAST_RATE_HZ, compute_sides, find_neighbours, linearize_joint
 from ..recording import Recording
+from ..rotations import wrap_angle
 from .equations import Gaussian, Layout
 from .least_squares import LEAST_CORRELATION_S, LeastSquares
 from .protocols import Axis, Closure, Direction, FreeMotion
@@ -72,11 +73,6 @@ def search_headings(fit: LeastSquares, stated: Mapping[str, float], couplings: C
     if not stated and all(isinstance(condition, FreeMotion) for condition in fit.layout.conditions):
         return headings + _turn_by_hinges(fit, headings)
     return headings
-
-
-def wrap_angle(angle: np.ndarray) -> np.ndarray:
-    """Return angles [rad] within half a turn."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def _collect_terms(fit: LeastSquares, couplings: Couplings | None) -> tuple[np.ndarray, np.ndarray]:

@@ -278,7 +278,7 @@ def express_deviation(hinge: HingeJoint, quat_on: ca.SX, quat_moves: ca.SX, erro
 def linearize_hinge(
     hinge: HingeJoint, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Linearize a hinge of orientations (n, 4) at heading errors (2,) [rad] of `moves` and `on`.
+    """Linearize a hinge of orientations (n, 4) at heading errors (2,) or (n, 2) [rad] of `moves` and `on`.
 
     Returns
     -------

@@ -39,6 +39,7 @@ from ..errors import BadSession
 from ..filters.phases import SensorNoise
 from ..observations import LEAST_RATE_HZ, PointPath, find_hinges, find_joint_pairs, linearize_hinge, linearize_joint
 from ..recording import Recording
+from ..rotations import wrap_angle
 
 CLASP = "clasp"  # the phase in which the palms are joined, and its protocol
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
@@ -65,6 +66,13 @@ CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.05
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
+# A loss may leave a heading so uncertain that what is observed has several minima: above `SEARCH_STD` [rad] relative to
+# others. It is searched on a circle of headings, each weighed by what is observed since, until it is known to
+# `FOUND_STD`; only sensors whose tilt is known to `SEARCH_TILT_STD` tell of it.
+SEARCH_STD, FOUND_STD, SEARCH_TILT_STD = np.deg2rad([35.0, 20.0, 8.0])
+CIRCLE = np.deg2rad(np.arange(-180.0, 180.0, 5.0))  # [rad]
+PEAK = np.deg2rad(60.0)  # [rad] from the likeliest heading, as far as its peak extends
+TAIL = 4.0  # degrees of freedom of a hinge's error on that circle, whose distribution has long tails
 # A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
 # than a share of the rms misfit; found by simulated people who walk, run, throw and reach.
 COHERENT_MARGIN, LARGEST_COHERENT_SHARE = 2.0, 0.5
@@ -97,8 +105,8 @@ RATE_STD, GIRDLE_STD, TWIST_STD, HINGE_STD = np.deg2rad([[0.05, 0.2], [0.9, 0.5]
 class HeadingFilter:
     """What observes the headings of k sensors, and the state and its covariance, knot by knot.
 
-    What the orientation filters of the sensors know after a sample is `filters` (4, k): the variance [rad²] of the
-    heading, and the columns of `Orientation.about_vertical`; NaN without a covariance.
+    What the orientation filters of the sensors know after a sample is `filters` (5, k): the variance [rad²] of the
+    heading, the columns of `Orientation.about_vertical`, and the variance [rad²] of the tilt; NaN without a covariance.
 
     Parameters
     ----------
@@ -228,6 +236,10 @@ class HeadingFilter:
         # over samples, in which older ones count less, and how many count.
         self._misfits = np.zeros((len(self.pairs), 16))
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
+        # Of a heading that is searched: its log-likelihood around the circle, whose zero is the estimate less `_turned`
+        # [rad], and the sensor to which it is relative, a step nearer to the one that is best known.
+        self._log_likelihood, self._turned = np.zeros((k, len(CIRCLE))), np.zeros(k)
+        self._relative_to = np.zeros(k, dtype=int)
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
         self._last_quat: np.ndarray | None = None  # (1, k, 4) of the last knot
         self._clasped_before = False  # whether the palms were joined in the last knot
@@ -242,6 +254,7 @@ class HeadingFilter:
         P[heading, heading], P[mount, mount], P[start, start] = start_var + mount_var, mount_var, start_var
         P[heading, mount] = P[mount, heading] = -mount_var
         P[heading, start] = P[start, heading] = start_var
+        self._searched = np.zeros(len(headings), dtype=bool)
 
     def step(
         self, quat_WL: np.ndarray, sides: np.ndarray, clasped: np.ndarray, lost: np.ndarray, filters: np.ndarray
@@ -254,11 +267,14 @@ class HeadingFilter:
         sides : (m, k, 3, 8) of each sensor at its joints, as `compute_sides`, band-passed; (0, …): not known
         clasped : (m,) bool: the palms are joined
         lost : (k,) bool: the sensor has lost a sample
-        filters : (4, k) at the end
+        filters : (5, k) at the end
         """
-        self.process = self._find_process(filters, lost, quat_WL)
+        self.process, leaps = self._find_process(filters, lost, quat_WL)
         self.predict(self.process)
-        unreliable = lost | self._lost_before  # after a loss the tilt may be wrong
+        unreliable, lost_now = lost | self._lost_before, lost  # after a loss the tilt may be wrong
+        order = self._find_searched(leaps)
+        tilted, lost = unreliable | ~(filters[4] < SEARCH_TILT_STD**2), lost | self._searched
+        unreliable = unreliable | self._searched
         palms = self.palms if clasped.any() else None
         if palms is not None and unreliable[[self.names.index(name) for name in palms.segments]].any():
             palms = None
@@ -277,12 +293,14 @@ class HeadingFilter:
             right = self.P @ (self._matrix @ (x - self.x) - self._vector)
             x = np.asarray(self.x + np.linalg.solve(identity + self.P @ self._matrix, right))
         self.x, self.P = x, symmetric(np.linalg.solve(identity + self.P @ self._matrix, self.P))
-        self._misfits, self._clasped_before, self._last, self._lost_before = misfits, bool(clasped.any()), filters, lost
+        self._misfits, self._clasped_before, self._last = misfits, bool(clasped.any()), filters
+        self._lost_before = lost_now
+        self._search(order, quat_WL, sides, tilted)
 
     def _find_process(
         self, filters: np.ndarray, lost: np.ndarray, quat_WL: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find how the state changes within a knot, the variance of that, and the rotation about the vertical.
+    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """Find the `process` of a knot, and the sensors (k,) whose heading's variance leaps.
 
         The heading variance of an orientation filter grows by the bias and the scale of its gyroscope too, which are
         states here. So its growth counts up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or
@@ -290,7 +308,7 @@ class HeadingFilter:
         less certain where another axis of the sensor becomes vertical.
         """
         heading, rate = self._columns["heading"], self._columns["rate"]
-        gained_var, corrected, corrected_rate, gained_rate_var = filters - self._last
+        gained_var, corrected, corrected_rate, gained_rate_var, _ = filters - self._last
         least = self._drift_psd * self.knot_s
         gained = np.maximum(gained_var, MIN_DRIFT_PSD * self.knot_s)
         known = np.isfinite(gained)
@@ -305,7 +323,7 @@ class HeadingFilter:
         quat = np.concatenate([quat_WL[:1] if self._last_quat is None else self._last_quat, quat_WL])
         self._last_quat = quat[-1:]
         turns = rotations.log(rotations.multiply(quat[1:], rotations.conjugate(quat[:-1])))
-        return change, variance, np.sum(turns[:, :, 2], axis=0)
+        return (change, variance, np.sum(turns[:, :, 2], axis=0)), leaps
 
     def advance(self, values: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """Return F v of one knot for v (n,) or (n, m); `turn` (k,) [rad] is the rotation about the vertical.
@@ -361,12 +379,7 @@ class HeadingFilter:
             sums = (e.T @ f).ravel(), np.sum(e**2, axis=0), np.sum(f**2, axis=0), [len(e)]
             misfit[:] = decay * misfit + np.concatenate(sums)
             r, H = e.ravel(), jacobian.reshape(-1, len(_JOINT_JACOBIAN)) @ _JOINT_JACOBIAN
-            variance, coherent_var = _split_misfit(misfit, correlated)
-            least_var = ACCELERATION_STD**2
-            weight = 1.0 / (max(float(np.mean(r**2)), variance, least_var) * correlated)
-            # What is coherent counts as one observation over the time that is remembered.
-            weight /= 1.0 + weight * float(H[:, 0] @ H[:, 0]) * coherent_var * (misfit[-1] / len(e))
-            self._add(columns, H, r, weight)
+            self._add(columns, H, r, _weigh_joint(misfit, float(np.mean(r**2)), H, correlated))
         return misfits
 
     def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> None:
@@ -394,6 +407,102 @@ class HeadingFilter:
         is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
         r, H = r[is_inlier].ravel(), H[is_inlier].reshape(-1, H.shape[2])
         self._add(self._columns["heading"], H, r, 1.0 / correlated)
+
+    def _find_searched(self, leaps: np.ndarray) -> list[int]:
+        """Find the sensors whose heading is searched, and return the order (k,) in which, after all others."""
+        relative_var = self._relative_var()
+        is_narrow = relative_var < SEARCH_STD**2
+        best = int(np.lexsort((np.diag(self.P)[: len(leaps)], -is_narrow.sum(axis=1)))[0])  # known to most others
+        begins = leaps & ~is_narrow[best]
+        searched = begins | self._searched
+        order, relative_to = np.flatnonzero(~searched).tolist(), np.full(len(leaps), best)
+        joined = [(near, far) for near, far, *_ in (*self._pair_columns, *self._hinge_columns)]
+        for known in order if searched.any() else ():
+            for i in (a + b - known for a, b in joined if known in (a, b)):
+                if i not in order:
+                    order.append(i)
+                    relative_to[i] = known
+        order += [i for i in range(len(leaps)) if i not in order]
+        begins |= searched & (relative_to != self._relative_to)
+        for i in (i for i in order if searched[i]):
+            var = relative_var[i, relative_to[i]]
+            if begins[i]:
+                self._turned[i], self._log_likelihood[i] = 0.0, -0.5 * CIRCLE**2 / var
+            else:
+                searched[i] = var > FOUND_STD**2 or searched[relative_to[i]]
+        self._searched, self._relative_to = searched, relative_to
+        return order
+
+    def _relative_var(self) -> np.ndarray:
+        """Return the variance (k, k) [rad²] of each heading relative to each other one."""
+        P = self.P[: len(self.names), : len(self.names)]
+        return np.asarray(np.diag(P)[:, None] + np.diag(P) - 2.0 * P)
+
+    def _search(self, order: list[int], quat_WL: np.ndarray, sides: np.ndarray, tilted: np.ndarray) -> None:
+        """Search headings by the observations of a knot: estimate each by its likeliest peak, and by the second moment
+        about that, to which all the others contribute.
+        """
+        x, relative_var = self.x.copy(), self._relative_var()
+        for i in (i for i in order if self._searched[i]):
+            other = self._relative_to[i]
+            relative = x[i] - x[other]
+            var = np.where(tilted | (relative_var[other] > SEARCH_STD**2), np.inf, relative_var[other])
+            log_likelihood = self._log_likelihood[i]
+            if not tilted[i]:
+                log_likelihood += self._weigh_headings(x, i, CIRCLE - self._turned[i], var, quat_WL, sides)
+            probability = np.exp(log_likelihood - log_likelihood.max())
+            probability /= probability.sum()
+            off = wrap_angle(CIRCLE - CIRCLE[np.argmax(probability)])
+            in_peak = np.where(np.abs(off) < PEAK, probability, 0.0)
+            mean = CIRCLE[np.argmax(probability)] + in_peak @ off / in_peak.sum()
+            variance = probability @ wrap_angle(CIRCLE - mean) ** 2
+            turned = wrap_angle(mean - self._turned[i])
+            self._turned[i] += turned
+            self.x[i] = self.x[other] + relative + turned
+            self.P[i], self.P[:, i] = self.P[other], self.P[:, other]
+            self.P[i, i] += variance
+
+    def _weigh_headings(
+        self, x: np.ndarray, i: int, turns: np.ndarray, var: np.ndarray, quat_WL: np.ndarray, sides: np.ndarray
+    ) -> np.ndarray:
+        """Return the log-likelihood (g,) of x with sensor i's heading turned by each of (g,) [rad].
+
+        `var` (k,) [rad²] is that of the other headings; of an infinite one nothing is observed.
+        """
+        total, m, g = np.zeros(len(turns)), len(quat_WL), len(turns)
+        correlated = max(1.0, ACCELERATION_CORRELATION_S * self.rate_hz)
+        for misfit, columns in zip(self._misfits, self._pair_columns, strict=True):
+            near, far, joint = columns[:3]
+            if i not in (near, far) or not np.isfinite(var[near + far - i]) or not len(sides):
+                continue
+            angle = x[near] - x[far] + x[joint]
+            e, jacobian, f = linearize_joint(sides[:, near], sides[:, far], angle, x[columns[3:10]], x[columns[10:]])
+            H = jacobian.reshape(-1, len(_JOINT_JACOBIAN)) @ _JOINT_JACOBIAN
+            # |e|² when f is turned about the vertical by u: far² + f² − 2 far · f.
+            u, far_f = turns * (1.0 if i == near else -1.0), e + f
+            along, across = np.sum(f[:, :2] * far_f[:, :2]), np.sum(f[:, 0] * far_f[:, 1] - f[:, 1] * far_f[:, 0])
+            squares = np.sum(e**2) + 2.0 * along - 2.0 * (along * np.cos(u) + across * np.sin(u))
+            weight = _weigh_joint(misfit, float(squares.min()) / e.size, H, correlated)
+            # What is constant about the sensors is off by as much for long.
+            P = self.P[np.ix_(columns[2:], columns[2:])]
+            constant_var = float(np.mean(np.sum(H[:, 2:] @ P * H[:, 2:], axis=1)))
+            weight /= 1.0 + weight * constant_var * FORCE_CORRELATION_S * self.rate_hz
+            total -= 0.5 * weight * squares
+        for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
+            moves, on = columns[:2]
+            other = moves + on - i
+            if i not in (moves, on) or not np.isfinite(var[other]):
+                continue
+            headings = np.tile(x[columns[:2]], (m, g, 1))
+            headings[:, :, 0 if i == moves else 1] += turns
+            quat_on, quat_moves = (np.repeat(quat_WL[:, at], g, axis=0) for at in (on, moves))
+            r, H, excess, _ = linearize_hinge(hinge, quat_on, quat_moves, headings.reshape(-1, 2))
+            by_other, H = H[:, 0 if other == moves else 1], H[:, _HINGE_COLUMNS[2:]]
+            r = r + H @ x[columns[2:]]
+            r_var = std**2 + var[other] * by_other**2 + np.sum(H @ self.P[np.ix_(columns[2:], columns[2:])] * H, axis=1)
+            misfit = np.log1p(r**2 / (TAIL * r_var)) + np.log1p(excess**2 / (TAIL * RANGE_STD**2))
+            total -= 0.5 * TAIL * misfit.reshape(m, g).sum(axis=0) / max(1.0, HINGE_CORRELATION_S * self.rate_hz)
+        return total
 
     def find_care(self, x: np.ndarray, P: np.ndarray) -> float:
         """Return the probability that the person took care in the start pose, by a state and its covariance.
@@ -427,6 +536,14 @@ class HeadingFilter:
         cov += care * (1.0 - care) * np.outer(change, change)
         of_headings, both = cov[:k, :k], cov[:k, k:]
         return (x[rows] + care * change)[:k], of_headings, of_headings + cov[k:, k:] + both + both.T
+
+
+def _weigh_joint(misfit: np.ndarray, squares: float, H: np.ndarray, correlated_samples: float) -> float:
+    """Return the weight [s⁴/m²] of a joint's rows in a knot, of slope H and mean square [m²/s⁴]."""
+    variance, coherent_var = _split_misfit(misfit, correlated_samples) if misfit[-1] else (0.0, 0.0)
+    weight = 1.0 / (max(squares, variance, ACCELERATION_STD**2) * correlated_samples)
+    # What is coherent counts as one observation over the time that is remembered.
+    return float(weight / (1.0 + weight * float(H[:, 0] @ H[:, 0]) * coherent_var * (misfit[-1] / (len(H) // 3))))
 
 
 def _split_misfit(misfit: np.ndarray, correlated_samples: float) -> tuple[float, float]:

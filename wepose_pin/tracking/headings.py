@@ -131,7 +131,7 @@ class HeadingCorrector:
         return self._count == self._size
 
     def close(self, filters: np.ndarray, end: float | None = None) -> None:
-        """Close the open knot; `filters` (4, k) is after its last sample at `end` [s]; None: not collected."""
+        """Close the open knot; `filters` (5, k) is after its last sample at `end` [s]; None: not collected."""
         n, rows = slice(self._count), slice(None, self._count, self.filter.stride)
         quat_WS, accel_S = rotations.multiply(self._quat_WV, self._quat_VS[n]), self._accel_S[n]
         sides = np.zeros((0, *accel_S.shape[1:], 8))
@@ -190,8 +190,8 @@ class HeadingCorrector:
         return self.filter.estimate(x, P, self.filter.find_care(x, P))
 
     def _set_variance(self, segment_covariance: np.ndarray) -> None:
-        correction = self._to - self._at_reset
-        self.variance = np.array([np.diag(segment_covariance), self._var_at_knot, correction**2])
+        left, correction = self._to - self._from, self._to - self._at_reset  # until it has faded in
+        self.variance = np.array([np.diag(segment_covariance) + left**2, self._var_at_knot, correction**2])
 
     def collect(self, knots: Sequence[tuple[Any, ...]] | None = None) -> HeadingCorrection:
         """Return what was observed and corrected causally so far; or `knots`, as `HeadingFilter.estimate` each."""
@@ -201,7 +201,7 @@ class HeadingCorrector:
         return HeadingCorrection(self.filter, np.array(self._times), *values)
 
     def smooth(self, filters: np.ndarray, end: float) -> HeadingCorrection | None:
-        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` (4, k) after the last sample at `end` [s].
+        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` (5, k) after the last sample at `end` [s].
 
         None: there is no knot.
         """

@@ -322,8 +322,8 @@ class Tracker:
             delta, known = correction.interpolate(chunk.time)
             variance = np.stack([known, np.full(known.shape, np.inf), delta**2], axis=2)
             variance[:, self._measured] = np.nan
-            values = *values[:4], variance, values[5]
             quat_WL = rotations.multiply(rotations.rotation_about(E_Z, delta), quat_WL)
+            values = *values[:2], quat_WL, values[3], variance, values[5]
         for i, (name, sensor) in enumerate(chunk.sensors.items()):
             cov = self._find_covariance(i, values, sensor.gap if is_smoothed else None)
             if cov is not None:
@@ -452,8 +452,9 @@ def track_chunks(
 
 
 def _describe_headings(quat_VS: np.ndarray, attitude_cov: np.ndarray, about_vertical: np.ndarray) -> np.ndarray:
-    """Return what the filters know of their headings after the last sample (4, k), as in `HeadingFilter`."""
-    return np.vstack([compute_heading_variance(quat_VS[-1], attitude_cov[-1]), about_vertical[-1].T])
+    """Return what the filters know of their headings after the last sample (5, k), as in `HeadingFilter`."""
+    heading_var = compute_heading_variance(quat_VS[-1], attitude_cov[-1])
+    return np.vstack([heading_var, about_vertical[-1].T, np.trace(attitude_cov[-1], axis1=1, axis2=2) - heading_var])
 
 
 def _find_specific_force(sensor: Sensor) -> np.ndarray:
