@@ -53,7 +53,7 @@ def calibrate(
     out
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     measured
-        May be given several times, as in biacromial=0.41.
+        May be given several times, as in --measured biacromial=0.41 --measured trunk=0.50.
     prior
         SUBJECT is a subject.toml or its folder.
     report

@@ -29,13 +29,13 @@ def info(
     Parameters
     ----------
     file
-        A file, or a folder: of one recording, or of files of one sensor each.
+        A file, or a folder with one recording or with one file for each sensor.
     write
         Write the session to session.toml beside the file.
     out
         Write the session to this file.
     model
-        Propose the segments of this body, such as whole_body (docs/models.md). Without it those of the upper body.
+        Propose the segments of this body, such as whole_body (docs/models.md). Without it, those of the upper body.
     """
     from ..body import load_model
     from ..documents import check_output, whole_file

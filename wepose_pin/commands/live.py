@@ -75,15 +75,15 @@ def live(
     guide
         Lead through the calibration first (docs/live.md). Needs no subject and no session.
     out
-        With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
+        With --guide: write subject, recordings and the sensors' setup to this folder. Without it, a new folder is
         named by the date.
     record
-        Write all that is received and the poses to this file, and let takes and moments be marked in it by keys;
-        `wepose track FILE` gives the same poses again.
+        Record all samples and poses in this file. Keys mark takes and moments in it. `wepose track FILE` gives the same
+        poses again.
     robot
-        Send joint commands that let this robot, as of `wepose retarget --robot`, follow the person, or the robot that a
-        TOML file names with arm, UDP port, rate, margins and timeouts (docs/live-outputs.md). First bring the robot
-        into the rest posture of its robot map.
+        Send joint commands with which this robot follows the person: a robot as in `wepose retarget --robot`, or a TOML
+        that names the robot, its arm, UDP port, rate, margins and timeouts (docs/live-outputs.md). First bring the
+        robot into the rest posture of its robot map.
     output
         Send each pose to udp:[HOST:]PORT as JSON, to lsl:NAME as a stream of the Lab Streaming Layer, or to the output
         of a plug-in (docs/live-outputs.md); may be given several times.
@@ -94,8 +94,8 @@ def live(
     measured
         May be given several times.
     protocol
-        In the guide without it: clasp+t_pose, and a bow too for sensors that measure orientations and no accelerations
-        where no session states the torso's mount.
+        In the guide it is then clasp+t_pose; a bow is added for sensors that measure only orientations, if no session
+        states the torso's mount.
     host
         Serve the page on this address of this machine, such as 0.0.0.0 for all, to open it on a phone. Its URL then
         holds a token, without which nobody can open it.

@@ -211,7 +211,7 @@ class PlainHelp:
             label, indent = f"  {', '.join(names)}", " " * _LABEL
             if entry.choices:
                 label = label.removesuffix("CHOICE") + "|".join(entry.choices)
-            columns = textwrap.fill(text, min(console.width, WIDEST), initial_indent=indent, subsequent_indent=indent)
+            columns = _fill(text, console.width, indent)
             below = f"\n{columns}" if len(label) >= _LABEL else columns[len(label) :]
             heading = f"{panel.title}:\n" if k == 0 else ""
             console.out(f"{heading}{label}{below}".rstrip(), highlight=False)
@@ -219,14 +219,19 @@ class PlainHelp:
             console.out("")
 
     def render_usage(self, console: Console, options: ConsoleOptions, usage: RenderableType) -> None:  # noqa: ARG002
-        console.out(_plain(usage), highlight=False, end="\n\n")
+        console.out(_plain(usage).replace("[ARGS...]", "[FURTHER...]"), highlight=False, end="\n\n")
 
     def render_description(self, console: Console, options: ConsoleOptions, text: RenderableType) -> None:  # noqa: ARG002
         for paragraph in _plain(text, paragraphs=True).split("\n\n"):
             line = " ".join(paragraph.split())
             if not line.startswith("Example: "):
-                line = textwrap.fill(line, min(console.width, WIDEST))
+                line = _fill(line, console.width)
             console.out(line, highlight=False, end="\n\n")
+
+
+def _fill(text: str, width: int, indent: str = "") -> str:
+    width = min(width, WIDEST)
+    return textwrap.fill(text, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _plain(text: RenderableType | None, paragraphs: bool = False) -> str:

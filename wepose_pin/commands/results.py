@@ -90,9 +90,9 @@ def evaluate(
     (Bland-Altman, ICC), and of each point's position, relative to the root and to the place where its limb begins; and
     whether the stated standard deviations are consistent with them. Writes nothing.
 
-    A table with the columns of pose.parquet is compared as it is, without alignment. A file of another system (.c3d,
-    .trc, .mvnx) is brought to the clock and the heading of the result first, by the first third of the result, which
-    is then not scored.
+    A table with the columns of pose.parquet is compared without alignment. A file of another system (.c3d, .trc,
+    .mvnx) is first aligned with the clock and the heading of the result. The first third of the result serves for
+    that and is not scored.
 
     Example: wepose evaluate result truth.parquet --interval 72 115
 
@@ -104,7 +104,7 @@ def evaluate(
         Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth); markers or
         rotations (.c3d), markers (.trc), an Xsens MVNX.
     align
-        Bring a file of another system to the clock and the world of the result.
+        Align a file of another system with the clock and the world of the result.
     fit
         Fit this to the result, also of a table. world: clock, heading and place; segments: in addition a constant
         rotation of each segment's frame, for frames that are not those of docs/concepts.md.
@@ -247,13 +247,13 @@ def angles(
     low_pass_hz
         Low-pass the orientations at this frequency (half the amplitude there). Without it they are not filtered.
     repetitions
-        Take each interval of this phase as a repetition. Without it repetitions are found.
+        Take each interval of this phase as a repetition. Without it they are found in the motion.
     main_angle
-        Find repetitions by this angle, such as right_elbow_flexion. Without it by the angle of the largest range.
+        Find repetitions by this angle, such as right_elbow_flexion. Without it, by the angle of the largest range.
     shoulder
         Use this sequence for the shoulder: YXY (plane of elevation, elevation, internal rotation), XZY or ZXY (flexion
         and adduction: no gimbal lock where the arm hangs). auto: YXY, or if it is near gimbal lock in the first result
-        for more than 1 % of the time, the one that is so least.
+        for more than 1 % of the time, the sequence that is near it least.
     """
     options = dict(locals())
     from polars import selectors

@@ -34,8 +34,8 @@ def retarget(
 ) -> Outcome:  # of what summary.json holds
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
-    Robots by name: panda, panda_table, ur5, ur5_table, so101, baxter, tiago_dual, talos, g1. Any other by its
-    URDF with a robot map beside it, a TOML that says which links are shoulder, elbow and hand (docs/robot-maps.md).
+    Robots by name: panda, panda_table, ur5, ur5_table, so101, baxter, tiago_dual, talos, g1. For any other
+    robot give its URDF, with a robot map beside it: a TOML that names shoulder, elbow and hand (docs/robot-maps.md).
 
     Exit code: 0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 one
     of these does not hold: the files are written, but no robot may run them; 2 invalid input, nothing is written.

@@ -46,7 +46,7 @@ def simulate(
         Write session.toml, recording.parquet, truth.parquet (columns as in pose.parquet) and subject.toml (the true
         lengths and mounts) to this folder.
     seed
-        Sample the person and the motion by this seed.
+        Generate a random person and motion from this seed.
     seconds
         Simulate this many seconds of the activity (without it 40) or of the protocol's motion (without it 60).
     protocol
@@ -56,7 +56,7 @@ def simulate(
         Simulate an activity in place of a protocol: walk (on the spot), sit (down and up), run or throw, of the whole
         body, with sensors on pelvis, head, hands and legs too; tasks (reaches, rests and typing), of the upper body.
     preset
-        Simulate only the sensors' noise and bias (ideal), or a person at the sizes of the literature (people): soft
+        Simulate only the sensors' noise and bias (ideal), or also a person as in the literature (people): soft
         tissue, shoulders that move with the arms, start poses as people hold them, errors of sensors and clocks; or a
         careful one at 0.3 of them (mild). docs/people.md has sizes and sources.
     rate_hz
@@ -134,7 +134,7 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
 
     A person of random size wears five Xsens MTi-3, stands in the N-pose, moves the joined hands and holds the T-pose, a
     minute in all, then draws six circles in the air with the right hand. All of it is simulated, so the truth is known.
-    The errors are those while the hand draws.
+    The errors that are printed are those of the circles.
 
     Example: wepose demo -o demo
 
@@ -143,7 +143,7 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
     out
         Write session/, subject/ and result/, each with its pages, to this folder.
     seed
-        Sample the person and the motion by this seed.
+        Generate a random person and motion from this seed.
     """
     from ..documents import signals_delayed, written
 

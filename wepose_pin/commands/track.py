@@ -49,10 +49,12 @@ def track(
     session
         The recording: session.toml, the folder that holds it, or a file that `wepose live --record` wrote.
     out
-        Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; of a
+        Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; for a
         mechanism joints.parquet too.
     subject
         SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it.
+    method
+        Without it amekf, or for a recording of `wepose live` the filter of that session.
     view
         Write view.html, the animation of the motion.
     report
@@ -60,8 +62,8 @@ def track(
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
     torques
-        Write torques.parquet too: joint torques by inverse dynamics. Assumed are a fixed base, gravity as the only
-        external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
+        Write torques.parquet too: joint torques by inverse dynamics. They assume a fixed base, gravity as the
+        only external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
     """
     options = dict(locals())
     from ..body.subject import load_subject, parse_subject

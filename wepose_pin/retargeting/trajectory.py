@@ -137,7 +137,7 @@ def retarget(
     task : "both", "position" or "orientation"
         Follow the position of the person's hands, their orientation, or both.
     rate_hz : float
-        Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
+        Sample the trajectory at this rate, 10 to 2000 Hz. Choose that of the robot's controller.
     scale : float, optional
         Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to
         the length of the person's (docs/retargeting.md).
@@ -146,12 +146,12 @@ def retarget(
     speed_scale : float, optional
         Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1. Without it 0.9.
     limit_margin : float, optional
-        Keep this distance from the position limits, in radians; of a prismatic joint a tenth of it, in metres. Without
+        Keep this distance from the position limits, in radians; for a prismatic joint a tenth of it, in metres. Without
         it 0.05.
     interval : (float, float), optional
         Use only this time of the recording, from and to in seconds.
     phase : str, optional
-        Use only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+        Use only this phase of the recording. If it has several intervals, NAME:2 is the second one.
     params : ControllerParams, optional
         Weights and gains of the controller.
     table : BodyTable, optional

@@ -65,19 +65,19 @@ def track(
         ncf (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011).
     model : BodyModel, str or Path, optional
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
-        whole_body (docs/models.md). A URDF without such a TOML, as a robot's, is a mechanism: its sensors are named by
-        its links. Without it the body that the session names, else the upper body.
+        whole_body (docs/models.md). A URDF without such a TOML, such as a robot's, is a mechanism, whose sensors are
+        named by its links. Without it the body that the session names, or the upper body.
     static_test : StaticTest, optional
         When a sensor counts as static; None: the default values.
     open_loop : bool
-        Correct no headings: neither by joint accelerations, by elbows as hinges and by joined hands, nor by the resets
-        of a live session. Orientations are those of the filter from the start pose on.
+        Correct no headings: neither by joint accelerations, elbows as hinges or joined hands, nor by the resets of a
+        live session. Orientations are those of the filter from the start pose on.
     causal : bool
         Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
     limits : bool
         Keep joints with one or two axes within the limits of the model.
     accept_failed : bool
-        Use a subject even if its calibration failed, which is else refused.
+        Use a subject even if its calibration failed, which is otherwise refused.
 
     Returns
     -------

@@ -144,15 +144,15 @@ def export(
     interval : (float, float), optional
         Use only this time of the recording, from and to in seconds.
     phase : str, optional
-        Use only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+        Use only this phase of the recording. If it has several intervals, NAME:2 is the second one.
     episodes : str, optional
         Only for lerobot: make each interval of this phase of the recording an episode, or, by the word repetitions,
         each repetition of the movement. Without it each result is an episode.
     instruction : str, optional
-        Only for lerobot: say what the robot does by this text. Without it "follow", and the name of the recording.
+        Only for lerobot: describe what the robot does by this text. Without it "follow" and the name of the recording.
     osim_model : str or Path, optional
-        Only for .sto and scale: name this model in the set-up files that are written, with .sto those of OpenSim's IMU
-        Placer and IMU Inverse Kinematics. Without it scale names Rajagopal_2015.osim.
+        Only for .sto and scale: name this model in the set-up files that are written; with .sto, these are OpenSim's
+        IMU Placer and IMU Inverse Kinematics. Without it, scale names Rajagopal_2015.osim.
     force : bool
         Replace an existing file, or a data set of the same format.
 
