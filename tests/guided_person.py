@@ -108,7 +108,7 @@ class PersonSource(Source):
         self.person = person
         self._rows, self._now = round(step_s * RATE_HZ), 0.0
         self.asleep_s = 0.0  # [s] for which nothing comes
-        self.gyro_scale = self.accel_scale = 1.0  # of the units that it sends to SI
+        self.accel_scale = 1.0  # of the unit that it sends to SI
 
     @property
     def orientations(self) -> dict[str, bool]:
@@ -132,7 +132,7 @@ class PersonSource(Source):
             own = [(t, *values[sensor]) for t, values in rows if sensor in values]
             if own:
                 time_s, gyro, accel = (np.array(column) for column in zip(*own, strict=True))
-                samples.append(Samples(sensor, time_s, self.gyro_scale * gyro, self.accel_scale * accel))
+                samples.append(Samples(sensor, time_s, gyro, self.accel_scale * accel))
         return samples
 
     def close(self) -> None: ...

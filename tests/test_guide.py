@@ -173,15 +173,6 @@ def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     session.guide.close()
 
 
-def test_rates_in_deg_s_are_said_before_a_sensor_is_shaken(tmp_path: Path) -> None:
-    session = Session(tmp_path)
-    session.source.gyro_scale = np.rad2deg(1.0)
-    moment = session.run(lambda m: "gravity" in m.view.note)[-1]
-    assert moment.step in ("sensors", "assignment")
-    assert "rad/s while gravity does not turn: deg/s? State the unit" in moment.view.note
-    assert moment.time < 10.0
-
-
 def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> None:
     session = Session(tmp_path)
     session.obeys = lambda _step, _view: ""

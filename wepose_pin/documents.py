@@ -294,8 +294,6 @@ def _revert(value: Any, key: Key) -> Any:
 
 # Atomic output -------------------------------------------------------------------------------------------------------
 
-written: list[Path] = []  # complete output folders, for the message of a command that is interrupted
-
 
 @contextmanager
 def signals_delayed() -> Iterator[None]:
@@ -350,7 +348,6 @@ def whole_folder(out: Path, force: bool = False, earlier: Sequence[str] = ()) ->
             else:
                 out.parent.mkdir(parents=True, exist_ok=True)
                 partial.rename(out)
-            written.append(out)
 
 
 def _check_folder(out: Path, force: bool, prefix: str) -> None:

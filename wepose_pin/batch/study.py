@@ -23,6 +23,7 @@ from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import polars as pl
@@ -110,7 +111,7 @@ def _run_here(run: RunItem, items: Sequence[Item], count: int) -> Generator[tupl
     while todo:
         pool = ProcessPoolExecutor(min(count, len(todo)), get_context("spawn"), _prepare_process)
         try:
-            with _limit_threads():  # of the processes, which begin here
+            with patch.dict(os.environ, dict.fromkeys(_ONE_THREAD.split(), "1")):  # the processes begin here
                 futures = {pool.submit(run, item): item for item in todo}
             for future in as_completed(futures):
                 if future.exception() is None:
@@ -146,19 +147,6 @@ def _run_on_scheduler(run: RunItem, items: Sequence[Item], address: str) -> Gene
                 again = "the scheduler is gone; the same command goes on where it stopped"
                 raise LostWorker(f"{address}: {again}") from None
             yield futures[future], row
-
-
-@contextlib.contextmanager
-def _limit_threads() -> Iterator[None]:
-    """Processes that begin in the block have one thread each."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD.split()}
-    os.environ |= dict.fromkeys(before, "1")
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            del os.environ[name]
-            os.environ |= {} if value is None else {name: value}
 
 
 def _prepare_process() -> None:

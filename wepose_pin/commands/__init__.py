@@ -4,7 +4,7 @@ A command does the whole job, prints what came of it, and returns it; the exit c
 returns. `main` runs the one that the command line names; `wepose_pin.batch` runs some of them for many recordings.
 Heavy rooms load inside the functions, so that help and mistakes in options are answered at once.
 
-Ctrl-C and SIGTERM end a command with what it has written whole, or nothing.
+Ctrl-C and SIGTERM end a command; its output is whole, or there is none.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ def main(argv: list[str] | None = None) -> None:
         if is_process:
             _catch_signals(signal.SIG_IGN)  # a second one would end in a traceback
         if _stopped or isinstance(error, KeyboardInterrupt):
-            code, line = 130, f"stopped; {_describe_written()}"
+            code, line = 130, "stopped"
         elif isinstance(error, WeposeError):
             code, line = 2, str(error)
         elif isinstance(error, OSError):
-            code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}; {_describe_written()}"
+            code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}"
         else:
             raise
         print(f"wepose: {line}", file=sys.stderr)
@@ -79,13 +79,6 @@ def check_stopped() -> None:
     """Raise `KeyboardInterrupt` where a signal came and a library has swallowed what it raised."""
     if _stopped:
         raise KeyboardInterrupt
-
-
-def _describe_written() -> str:
-    """What a command that ends early has written all the same, whole."""
-    written = getattr(sys.modules.get("wepose_pin.documents"), "written", ())
-    folders = [str(folder) for folder in written if folder.exists()]
-    return f"{', '.join(folders)} was written before" if folders else "nothing was written"
 
 
 @contextlib.contextmanager

@@ -145,7 +145,7 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
     seed
         Generate a random person and motion from this seed.
     """
-    from ..documents import signals_delayed, written
+    from ..documents import signals_delayed
 
     session, subject, result = parts = [out / name for name in ("session", "subject", "result")]
     new = [folder for folder in (out, *parts) if not folder.exists()]
@@ -169,6 +169,5 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
                     shutil.rmtree(folder, ignore_errors=True)
                 for folder in replaced:
                     (Path(earlier) / folder.name).rename(folder)
-                written.clear()
             raise
     say(f"Open {result / 'view.html'} to see the motion.")
