@@ -60,11 +60,9 @@ class TomlTable:
         """File and place of the table itself."""
         return self.at("").removesuffix(".")
 
-    def allow(self, *known: str, renamed: Mapping[str, str] | None = None) -> None:
-        """Refuse unknown keys; `renamed` has the advice for keys of an earlier version."""
+    def allow(self, *known: str) -> None:
+        """Refuse unknown keys."""
         for key in self.values:
-            if renamed and key in renamed:
-                raise self.error(f"{self.at(key)} {renamed[key]}")
             if key not in known:
                 raise self.error(f"{self.at(key)} is not a known key; {one_of(known, key)}")
 

@@ -37,10 +37,6 @@ from .registry import detect_format, find_format, read_device
 T = TypeVar("T")
 
 SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
-# Keys of earlier versions, with their replacements.
-_RENAMED_PHASES = {
-    "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
-}
 # Keys of a sensor that have an effect only where a format reads the file, or only where the session names columns.
 OF_FORMATS = ("format", "label", "use")
 OF_COLUMNS = ("gyro_unit", "accel_unit", "time", "time_unit")
@@ -129,7 +125,9 @@ def _find_model(path: Path, top: TomlTable) -> str:
 
 
 def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
-    keys.allow(*keys.values, renamed=_RENAMED_PHASES)
+    if "still" in keys:  # of an earlier version
+        needed = "write static = [[from, to]], seconds in which the sensors lie on a table"
+        raise BadSession(f"{keys.at('still')} is called static now: {needed}")
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
         pairs: list[Any] = value if isinstance(value, list) else [None]

@@ -75,9 +75,12 @@ def build_clock(time: np.ndarray, place: str, is_device: bool = False) -> Clock:
             f"{place}: time jumps from {format_span(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
         )
-    sample = np.arange(len(time)) + np.append(0, np.cumsum(lost, dtype=int))  # number of each row on the clock
-    row = np.full(sample[-1] + 1, -1)
-    row[sample] = np.arange(len(time))
+    rows = np.arange(len(time), dtype=np.int32)
+    if not lost.any():
+        return Clock(time, rows, step, packet)
+    sample = rows + np.append(0, np.cumsum(lost, dtype=int))  # number of each row on the clock
+    row = np.full(sample[-1] + 1, -1, dtype=np.int32)
+    row[sample] = rows
     return Clock(np.interp(np.arange(len(row)), sample, time), row, step, packet)
 
 
