@@ -355,7 +355,8 @@ def _bridge_gaps(
         signals[signal], good = _place_on_clock(values, clock, f"{place}{signal}", signal == "orientation")
         lost |= ~good
         if lost.all():
-            raise BadData(f"{place}{signal}: no numbers from {format_span(clock.time[[0, -1]])}")
+            when = "where the other signal has them, " if good.any() else ""
+            raise BadData(f"{place}{signal}: no numbers {when}from {format_span(clock.time[[0, -1]])}")
         if not gaps and (long := find_runs(clocks.find_long_gaps(~good, clock.step))):
             first, last = long[0]
             lost_s, row = (last - first) * clock.step, clock.row[:first].max(initial=-1) + 1
