@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -244,6 +245,9 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
+        for pair in permutations(members):
+            if pair in pose.heading_cov:  # what both have in common turns no joint
+                cov_W[:, 2, 2] -= 2.0 * pose.heading_cov[pair][known]
         rows = _gradients(values, joint.sequence, quat_WP, left)
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = _expand(known, np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN))

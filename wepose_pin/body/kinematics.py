@@ -48,6 +48,7 @@ class Pose:
     segment_cov : segment → (n, 3, 3) [rad²], covariance of the error rotation vector in W (on the left of `quat_WL`);
         empty where none is known
     point_cov : point → (n, 3, 3) [m²], covariance of the position in W
+    heading_cov : two segments → (n,) [rad²], covariance of their headings; only where it is known
     gap : segment → (n,) bool, true where its sensor lost samples for longer than 50 ms; only segments with such gaps
     joints : joint of one axis → (n,) [rad or m], of a mechanism alone
     """
@@ -60,13 +61,14 @@ class Pose:
     point_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
     joints: Mapping[str, np.ndarray] = field(default_factory=dict)
+    heading_cov: Mapping[tuple[str, str], np.ndarray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Pose({len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points)"
 
     def cut(self, span: slice | np.ndarray) -> Pose:
         """Return the pose of a span of samples, or of samples by their numbers."""
-        series = ("quat_WL", "points", "segment_cov", "point_cov", "gap", "joints")
+        series = ("quat_WL", "points", "segment_cov", "point_cov", "gap", "joints", "heading_cov")
         parts = {name: {key: rows[span] for key, rows in getattr(self, name).items()} for name in series}
         return replace(self, time=self.time[span], q=None if self.q is None else self.q[span], **parts)
 

@@ -21,6 +21,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadSession, one_of
 from ..recording import CONFIGURATION, OrientationSensor, Recording, format_span
 from .body import BodyModel
+from .soft_tissue import estimate_repeat_share
 from .subject import Subject
 from .table import NEUTRAL_POSE, BodyTable, Vector, load_table
 from .tree import check_joint_values, parse_tree
@@ -46,11 +47,12 @@ class StartPose:
     R_WK: Mapping[str, np.ndarray] = field(default_factory=dict)  # link → (3, 3); without: the frame of W
     table: BodyTable = field(default_factory=load_table)
     q: np.ndarray | None = None  # (nq,) the body's configuration; None: not known
+    repeat_share: float = 1.0  # of how much people repeat it (`estimate_repeat_share`)
 
     def std(self, segment: str, *, again: bool = False) -> np.ndarray:
         """Return one std (3,) [rad] of a segment's rotation off the start pose, or, `again`, between two of them."""
         own = self.table.segments[segment]
-        return np.array(own.repeat_std if again else own.start_std)
+        return self.repeat_share * np.array(own.repeat_std) if again else np.array(own.start_std)
 
     def rotation(self, link: str) -> np.ndarray:
         """Return the orientation (3, 3) of a link."""
@@ -172,8 +174,10 @@ def align_sensors(
     R_VS_start: Mapping[str, Rotation],
     start: tuple[float, float],
     start_pose: StartPose = N_POSE,
-) -> tuple[dict[str, Rotation], dict[str, float], list[Diagnostic]]:
+) -> tuple[dict[str, Rotation], dict[str, float], list[Diagnostic], float]:
     """Compute mounts R_LS and heading offsets ψ [rad] of all sensors, with the diagnostics of the mounts.
+
+    The last number is `StartPose.repeat_share`.
 
     Parameters
     ----------
@@ -188,6 +192,7 @@ def align_sensors(
     nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
     mounts: dict[str, Rotation] = {}
     heading_offsets: dict[str, float] = {}
+    repeats = list[float]()
     # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     for segment, R_VS in R_VS_start.items():
@@ -224,10 +229,11 @@ def align_sensors(
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - subject.start_pose_offset[segment][:2]
                 misfit_cov = np.diag(start_pose.std(segment, again=True)[:2] ** 2)
+                repeats += (misfit / np.sqrt(np.diag(misfit_cov))).tolist()
             stds, value = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5, float(np.linalg.norm(misfit))
             if stds > MOUNT_MOVED_STDS:
                 limit = value * MOUNT_MOVED_STDS / stds  # [rad] in the direction of the misfit
                 facts: dict[str, float | str] = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
                 diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
         mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi
-    return mounts, heading_offsets, diagnostics
+    return mounts, heading_offsets, diagnostics, estimate_repeat_share(repeats)

@@ -54,6 +54,18 @@ def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> 
     return max(share, LEAST_POSE_SHARE)
 
 
+def estimate_repeat_share(tilts: Collection[float]) -> float:
+    """Estimate how much a start pose differs from that of the calibration, as a share of what the table states.
+
+    It follows by empirical Bayes from the `tilts` between both, each over its standard deviation: who repeats them
+    exactly, as in the calibration's own recording, repeats the headings too, which nothing shows.
+    """
+    if not tilts:
+        return 1.0
+    weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + POSE_LOG_STD**2 + 0.5 / len(tilts))
+    return min(float(np.sqrt(np.mean(np.square([*tilts]))) ** weight), 1.0)
+
+
 def make_personal(tissue: SoftTissue, share: float, lag: float, scatter: float) -> SoftTissue:
     """Return the soft tissue of one person: its own means, and the standard deviations that remain beyond them.
 

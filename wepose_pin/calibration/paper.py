@@ -53,7 +53,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     """
     _check_problem(problem)
     recording, prior = problem.recording, problem.prior
-    mounts, _, mount_diagnostics = align_sensors(recording, prior, problem.R_VS_start, problem.start)
+    mounts, _, mount_diagnostics, _ = align_sensors(recording, prior, problem.R_VS_start, problem.start)
     data, condition_index, samples = problem.observe()
     quat_WL = problem.orient_segments({name: mount.as_quat() for name, mount in mounts.items()}, samples)
     names = problem.layout.lengths

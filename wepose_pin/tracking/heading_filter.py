@@ -115,6 +115,7 @@ class HeadingFilter:
     noises : of sensors with a filter
     subject, model : the person, and the body with the person's lengths
     start : `filters` at the end of the start pose
+    repeat_share : as of `StartPose`
     causal : headings are corrected as samples come; a short clasp then counts as one observation
 
     Attributes
@@ -136,6 +137,7 @@ class HeadingFilter:
         subject: Subject,
         model: BodyModel,
         start: np.ndarray,
+        repeat_share: float,
         *,
         causal: bool,
     ) -> None:
@@ -177,16 +179,18 @@ class HeadingFilter:
         # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
         # gyroscope's bias, or the drift of measured orientations.
         self._drift_psd, rate_std = np.full(k, DRIFT_PSD), np.full(k, MEASURED_RATE_STD)
-        self.start_var, self.mount_var = np.full(k, REFERENCE_START_STD**2), np.full(k, LEAST_MOUNT_VAR)
+        self.start_var, again = np.full(k, REFERENCE_START_STD**2), StartPose(table=model.table, repeat_share=repeat_share)
         for i, name in enumerate(self.names):
             if name in noises:  # a gyroscope's white noise may be more
                 gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
                 self._drift_psd[i] = max(DRIFT_PSD, gyro_psd)
                 rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
             if name != model.table.reference:
-                self.start_var[i] = compute_start_heading_var(first, name, subject, StartPose(table=model.table))
-            if (mount_cov := find_mount_covariance(first, name, subject)) is not None:
-                self.mount_var[i] = max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
+                self.start_var[i] = compute_start_heading_var(first, name, subject, again)
+        # (k, k) [rad²]; a calibration knows the headings of mounts against each other better than that of each.
+        rows = [f"mounts.{name}.z" for name in self.names]
+        known_rows = [] if first.remounted else rows
+        self.mount_cov = subject.lengths_covariance(known_rows or rows) * bool(known_rows) + LEAST_MOUNT_VAR * np.eye(k)
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
         h, always, known = len(self.hinges), np.inf, np.sqrt(start[3])
         rate_std = np.hypot(RATE_STD[kind], np.where(np.isfinite(known), known, rate_std))
@@ -246,14 +250,16 @@ class HeadingFilter:
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ = s − ε_z (k,) [rad] after a start pose with errors s, with the errors ε_z of mounts."""
-        P, start_var, mount_var = self.P, self.start_var, self.mount_var
+        P, start_cov, mount_cov = self.P, np.diag(self.start_var), self.mount_cov
         heading, mount, start = (self._columns[name] for name in ("heading", "mount", "start"))
         self.x[heading], self.x[start] = headings, 0.0
         for columns in (heading, mount, start):
             P[columns, :], P[:, columns] = 0.0, 0.0
-        P[heading, heading], P[mount, mount], P[start, start] = start_var + mount_var, mount_var, start_var
-        P[heading, mount] = P[mount, heading] = -mount_var
-        P[heading, start] = P[start, heading] = start_var
+        columns = np.concatenate([heading, mount, start])
+        none = np.zeros(mount_cov.shape)
+        P[np.ix_(columns, columns)] = np.block(
+            [[start_cov + mount_cov, -mount_cov, start_cov], [-mount_cov, mount_cov, none], [start_cov, none, start_cov]]
+        )
         self._searched = np.zeros(len(headings), dtype=bool)
 
     def step(

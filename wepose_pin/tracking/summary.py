@@ -270,7 +270,7 @@ class TrackSummary:
             yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING)
         if correction is None:
             return
-        start_std = np.sqrt(correction.filter.start_var + correction.filter.mount_var)
+        start_std = np.sqrt(correction.filter.start_var + np.diag(correction.filter.mount_cov))
         for (name, turned_deg), std in zip(correction.max_correction_deg.items(), start_std.tolist(), strict=True):
             limit = max(TURNED, TURNED_STDS * std)
             if (turned := float(np.deg2rad(turned_deg))) > limit:

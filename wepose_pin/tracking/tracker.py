@@ -196,7 +196,10 @@ class Tracker:
         )
         orientation = self._filters.push(first)
         R_VS_start = average_start(first, collect_orientations(first, orientation), self._start)
-        mounts, offsets, of_mounts = align_sensors(first, self._subject, R_VS_start, self._start, self._start_pose)
+        mounts, offsets, of_mounts, share = align_sensors(
+            first, self._subject, R_VS_start, self._start, self._start_pose
+        )
+        self._start_pose = replace(self._start_pose, repeat_share=share)
         self.diagnostics = tuple(drop_consequences((*diagnostics, *of_mounts)))
         self.names, self._rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         k = len(self.names)
@@ -224,7 +227,9 @@ class Tracker:
             known = _describe_headings(*(values[:begin] for values in states))
             noises = {name: each.noise for name, each in orientation.items()}
             mounts = dict(zip(self.names, self._quat_LS, strict=True))
-            heading_filter = HeadingFilter(chunk, mounts, noises, self._person, self._body, known, causal=self._causal)
+            heading_filter = HeadingFilter(
+                chunk, mounts, noises, self._person, self._body, known, self._start_pose.repeat_share, causal=self._causal
+            )
             if heading_filter.is_observed:
                 self._headings = HeadingCorrector(heading_filter, self._heading_offset.copy())
                 self._variance = self._headings.variance if self._causal else self._variance
@@ -347,7 +352,7 @@ class Tracker:
         shared = {} if correction is None else correction.correlate_segments(chunk.time, covariances)
         point_cov = compute_point_covariances(body, pose.quat_WL, covariances, shape_cov, pose.q, shared)
         gap = {name: sensor.gap for name, sensor in chunk.sensors.items() if sensor.gap is not None}
-        pose = replace(pose, segment_cov=covariances, point_cov=point_cov, gap=gap)
+        pose = replace(pose, segment_cov=covariances, heading_cov=shared, point_cov=point_cov, gap=gap)
         return TrackResult(chunk.name, pose, body, self._person, chunk.phases, chunk.marks, segments, correction)
 
     # Single samples --------------------------------------------------------------------------------------------------
