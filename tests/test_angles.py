@@ -304,6 +304,17 @@ def test_standard_deviations_are_those_of_drawn_errors(name: str) -> None:
         np.testing.assert_allclose(spread[joint].values.std(axis=0), joint_angle.std[0], rtol=0.03)
 
 
+def test_a_heading_that_two_segments_share_makes_no_angle_uncertain() -> None:
+    sizes = {"right_upper_arm": 3.0, "right_forearm": 3.0, "torso": 0.0}  # [deg]
+    quats = {name: Rotation.from_rotvec([0.3, 0.2, 0.1]).as_quat()[None] for name in sizes}
+    cov = {name: np.diag([1e-6, 1e-6, np.radians(size) ** 2])[None] for name, size in sizes.items()}
+    shared = {("right_forearm", "right_upper_arm"): np.full(1, np.radians(3.0) ** 2)}
+    alone, common = (joint_angles(pose_with(quats, segment_cov=cov, heading_cov=each)) for each in ({}, shared))
+    assert np.degrees(np.linalg.norm(alone["right_elbow"].std)) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.1)
+    assert np.degrees(np.linalg.norm(common["right_elbow"].std)) < 0.2
+    np.testing.assert_array_equal(alone["right_shoulder"].std, common["right_shoulder"].std)
+
+
 def test_towards_the_lock_the_deviation_grows_to_that_of_any_angle() -> None:
     away = np.radians([90.0, 45.0, 20.0, 5.0, 1.0, 1e-3, 0.0])
     angles = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import IDEAL_PRESET, PEOPLE_PRESET, calibrate, load_model, population_subject, simulate, track
-from wepose_pin.body.soft_tissue import LEAST_POSE_SHARE, USUAL_POSE_SHARE, estimate_pose_share
-from wepose_pin.body.subject import Hinge
+from wepose_pin.body.soft_tissue import LEAST_SHARE, USUAL_POSE_SHARE, estimate_pose_share
+from wepose_pin.body.subject import Hinge, mount_rows
 from wepose_pin.simulation import simulate_person
 
 
@@ -29,6 +29,20 @@ def test_segments_that_hang_on_each_other_share_how_exactly_a_person_stood(offse
     for name in ("torso", "pelvis", "head"):
         share = own[name].start_std[2] / body.table.segments[name].start_std[2]
         assert share == pytest.approx(estimate_pose_share(tilts, body.table) / USUAL_POSE_SHARE)
+
+
+def test_who_repeats_the_tilts_of_the_start_pose_repeats_its_headings() -> None:
+    """As in the recording of the calibration; another start pose is as uncertain as that of people."""
+    simulation = simulate(simulate_person(3).lengths, seed=3, clasp_s=10.0, circles=0)
+    recording, order = simulation.recording(), tuple(row for name in simulation.quat_LS for row in mount_rows(name))
+    subject = replace(population_subject(), mounts=simulation.quat_LS, order=order, covariance=1e-6 * np.eye(len(order)))
+    stds = []
+    for offset in (0.0, 0.06):
+        offsets = {name: np.array([offset, -offset, 0.01]) for name in simulation.quat_LS}
+        tracked = track(recording, replace(subject, start_pose_offset=offsets), open_loop=True)
+        cov = tracked.pose.segment_cov["right_upper_arm"][:, 2, 2]
+        stds.append(np.degrees(np.sqrt(cov[recording.span(recording.phases["start"][0])].mean())))
+    assert np.sqrt(stds[1] ** 2 - stds[0] ** 2) == pytest.approx(7.0, rel=0.05)  # `repeat_std_deg`
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])
@@ -74,7 +88,7 @@ def test_arms_show_how_exactly_a_person_stood() -> None:
 @pytest.mark.parametrize(
     ("offset", "share"),
     [
-        ((0.0, 0.0, 0.01), LEAST_POSE_SHARE),
+        ((0.0, 0.0, 0.01), LEAST_SHARE),
         ((0.3, 0.3, 0.3), 1.0),  # not shown
         ((0.3, 0.3, np.nan), 1.0),
         ((0.15, 0.0, 0.01), 0.68),

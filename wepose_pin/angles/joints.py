@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -245,9 +244,9 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
-        for pair in permutations(members):
-            if pair in pose.heading_cov:  # what both have in common turns no joint
-                cov_W[:, 2, 2] -= 2.0 * pose.heading_cov[pair][known]
+        for (a, b), shared in pose.heading_cov.items():
+            if {a, b} == {*members}:  # what both have in common turns no joint
+                cov_W[:, 2, 2] -= 2.0 * shared[known]
         rows = _gradients(values, joint.sequence, quat_WP, left)
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = _expand(known, np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN))

@@ -22,7 +22,8 @@ SCATTER_LOG_STD = 0.5
 # of a segment's share scatters about that of its person, which scatters as that of soft tissue; assumptions.
 USUAL_POSE_SHARE, POSE_LOG_STD = 0.78, 0.35
 SHOWN = 0.5  # times its standard deviation among people: a tilt that is known better counts
-LEAST_POSE_SHARE = 0.25  # nobody stands more exactly
+LEAST_REPEAT_SHARE = 0.01
+LEAST_SHARE = 0.25  # nobody stands more exactly, or wears firmer straps
 
 
 def estimate_scatter(hinge_stds: Collection[float]) -> float:
@@ -33,7 +34,8 @@ def estimate_scatter(hinge_stds: Collection[float]) -> float:
     if not hinge_stds:
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + HINGE_LOG_STD**2)
-    return float(np.exp(weight * np.mean(np.log(np.array([*hinge_stds]) / USUAL_HINGE_STD))))
+    ratios = np.maximum(np.array([*hinge_stds]) / USUAL_HINGE_STD, 1e-3)
+    return max(float(np.exp(weight * np.mean(np.log(ratios)))), LEAST_SHARE)
 
 
 def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> float:
@@ -51,7 +53,7 @@ def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> 
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + POSE_LOG_STD**2)
     share = USUAL_POSE_SHARE * float(np.sqrt(np.mean(squares)) / USUAL_POSE_SHARE) ** weight
-    return max(share, LEAST_POSE_SHARE)
+    return max(share, LEAST_SHARE)
 
 
 def estimate_repeat_share(tilts: Collection[float]) -> float:
@@ -63,7 +65,7 @@ def estimate_repeat_share(tilts: Collection[float]) -> float:
     if not tilts:
         return 1.0
     weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + POSE_LOG_STD**2 + 0.5 / len(tilts))
-    return min(float(np.sqrt(np.mean(np.square([*tilts]))) ** weight), 1.0)
+    return float(np.clip(np.sqrt(np.mean(np.square([*tilts]))) ** weight, LEAST_REPEAT_SHARE, 1.0))
 
 
 def make_personal(tissue: SoftTissue, share: float, lag: float, scatter: float) -> SoftTissue:

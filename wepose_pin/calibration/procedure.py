@@ -362,7 +362,7 @@ def _estimate_hinges(fit: LeastSquares, x_cov: np.ndarray) -> tuple[dict[str, Hi
             axis_L = layout.start_pose.rotation(term.on).T @ axis / np.linalg.norm(axis)
             bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
             hinge_rms[term.name] = rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
-            hinges[term.name] = Hinge(axis_L, max(rms, term.softness), lags.get(term.on))
+            hinges[term.name] = Hinge(axis_L, rms, lags.get(term.on))
     return hinges, hinge_rms
 
 

@@ -30,7 +30,6 @@ from ..body.mounts import (
     SEGMENT_ATTITUDE_STD,
     StartPose,
     compute_start_heading_var,
-    find_mount_covariance,
 )
 from ..body.subject import Subject
 from ..body.table import HingeJoint
@@ -179,7 +178,10 @@ class HeadingFilter:
         # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
         # gyroscope's bias, or the drift of measured orientations.
         self._drift_psd, rate_std = np.full(k, DRIFT_PSD), np.full(k, MEASURED_RATE_STD)
-        self.start_var, again = np.full(k, REFERENCE_START_STD**2), StartPose(table=model.table, repeat_share=repeat_share)
+        self.start_var, again = (
+            np.full(k, REFERENCE_START_STD**2),
+            StartPose(table=model.table, repeat_share=repeat_share),
+        )
         for i, name in enumerate(self.names):
             if name in noises:  # a gyroscope's white noise may be more
                 gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
@@ -258,7 +260,11 @@ class HeadingFilter:
         columns = np.concatenate([heading, mount, start])
         none = np.zeros(mount_cov.shape)
         P[np.ix_(columns, columns)] = np.block(
-            [[start_cov + mount_cov, -mount_cov, start_cov], [-mount_cov, mount_cov, none], [start_cov, none, start_cov]]
+            [
+                [start_cov + mount_cov, -mount_cov, start_cov],
+                [-mount_cov, mount_cov, none],
+                [start_cov, none, start_cov],
+            ]
         )
         self._searched = np.zeros(len(headings), dtype=bool)
 

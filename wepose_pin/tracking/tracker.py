@@ -228,7 +228,14 @@ class Tracker:
             noises = {name: each.noise for name, each in orientation.items()}
             mounts = dict(zip(self.names, self._quat_LS, strict=True))
             heading_filter = HeadingFilter(
-                chunk, mounts, noises, self._person, self._body, known, self._start_pose.repeat_share, causal=self._causal
+                chunk,
+                mounts,
+                noises,
+                self._person,
+                self._body,
+                known,
+                self._start_pose.repeat_share,
+                causal=self._causal,
             )
             if heading_filter.is_observed:
                 self._headings = HeadingCorrector(heading_filter, self._heading_offset.copy())
