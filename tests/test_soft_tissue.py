@@ -35,7 +35,9 @@ def test_who_repeats_the_tilts_of_the_start_pose_repeats_its_headings() -> None:
     """As in the recording of the calibration; another start pose is as uncertain as that of people."""
     simulation = simulate(simulate_person(3).lengths, seed=3, clasp_s=10.0, circles=0)
     recording, order = simulation.recording(), tuple(row for name in simulation.quat_LS for row in mount_rows(name))
-    subject = replace(population_subject(), mounts=simulation.quat_LS, order=order, covariance=1e-6 * np.eye(len(order)))
+    subject = replace(
+        population_subject(), mounts=simulation.quat_LS, order=order, covariance=1e-6 * np.eye(len(order))
+    )
     stds = []
     for offset in (0.0, 0.06):
         offsets = {name: np.array([offset, -offset, 0.01]) for name in simulation.quat_LS}
