@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin import OrientationSensor, Recording, Simulation, Subject, calibrate, population_subject, simulate
+from wepose_pin.body.soft_tissue import LEAST_SHARE
 from wepose_pin.simulation import Person, simulate_person
 
 
