@@ -228,8 +228,9 @@ def align_sensors(
             if segment in subject.start_pose_offset:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - subject.start_pose_offset[segment][:2]
-                misfit_cov = np.diag(start_pose.std(segment, again=True)[:2] ** 2)
-                repeats += (misfit / np.sqrt(np.diag(misfit_cov))).tolist()
+                repeat_std = np.array(start_pose.table.segments[segment].repeat_std[:2])
+                misfit_cov = np.diag(repeat_std**2)
+                repeats += (misfit / repeat_std).tolist()
             stds, value = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5, float(np.linalg.norm(misfit))
             if stds > MOUNT_MOVED_STDS:
                 limit = value * MOUNT_MOVED_STDS / stds  # [rad] in the direction of the misfit
