@@ -28,7 +28,7 @@ ALLOWED = {
     "live/sources/slimevr.py": "the numbers of a format",
     "report/words.py": "a plural of English",
     "readers/mvnx.py": "the names of a format",
-    "writers/bvh.py": "the names of a format",
+    "writers/motion_capture.py": "the names of a format",
     "writers/opensim.py": "the names of a format",
     "retargeting/maps.py": "the keys of a robot's map",
     "simulation/": "simulated people and activities",

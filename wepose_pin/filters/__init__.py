@@ -99,14 +99,14 @@ class SensorFilters:
         static_test: StaticTest | None = None,
         start: slice | None = None,
     ) -> None:
-        self._method, self._params, self._start = check_method(method), params, start
-        self._test = static_test or USUAL_TEST
-        if METHODS[method] is PUBLISHED_SMEKF:
+        self._filter, self._params, self._start = METHODS[check_method(method)], params, start
+        self._is_offline, self._test = method in OFFLINE, static_test or USUAL_TEST
+        if self._filter is PUBLISHED_SMEKF:
             self._test = replace(self._test, rate_stds=np.inf)
         self.names, self._noises = tuple(noises), dict(noises)
         self._records: dict[str, tuple[_Records, _Records]] = {}  # of the static test and of the filter
         k = len(self.names)
-        self._now = make_orientation(k, TYPICAL, covariance=METHODS[method].has_covariance)
+        self._now = make_orientation(k, TYPICAL, covariance=self._filter.has_covariance)
         self._rows = [self._now.take(slice(i, i + 1)) for i in range(k)]  # of each sensor
         self.quat_VS, self.gyro_bias, self.static, self.attitude_cov = self._now[:4]
         self.about_vertical = self._now.about_vertical
@@ -115,7 +115,7 @@ class SensorFilters:
         """Filter a chunk; `BadData`: the start phase has no gravity."""
 
         def run(name: str) -> Orientation:
-            return self._filter(name, chunk.imus[name], chunk.rate_hz)
+            return self._run_chunk(name, chunk.imus[name], chunk.rate_hz)
 
         threads = min(count_processors(), len(self.names))
         if threads > 1:  # compiled runs release the interpreter's lock
@@ -135,25 +135,24 @@ class SensorFilters:
         """
         if np.shape(gyro_S) != self.gyro_bias.shape or np.shape(accel_S) != self.gyro_bias.shape:
             raise BadData(f"gyro_S {np.shape(gyro_S)} and accel_S {np.shape(accel_S)}: {len(self.names)} rows of three")
-        filter_ = METHODS[self._method]
         gyro_S, accel_S = (np.ascontiguousarray(each, dtype=float) for each in (gyro_S, accel_S))
         for i, name in enumerate(self.names):
-            _run(filter_, self._records[name], (gyro_S[i : i + 1], accel_S[i : i + 1]), self._rows[i])
+            _run(self._filter, self._records[name], (gyro_S[i : i + 1], accel_S[i : i + 1]), self._rows[i])
         return self.quat_VS
 
-    def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
+    def _run_chunk(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
         """Filter a chunk of one sensor."""
         gyro_S, accel_S = (np.ascontiguousarray(each, dtype=float) for each in (sensor.gyro_S, sensor.accel_S))
         if sensor.gap is not None:
             # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
             gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
-        begin, cov, filter_ = 0, None, METHODS[self._method]
-        out = make_orientation(len(gyro_S), self._noises[name], covariance=filter_.has_covariance)
+        begin, cov = 0, None
+        out = make_orientation(len(gyro_S), self._noises[name], covariance=self._filter.has_covariance)
         if name not in self._records:
             begin = self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range, out)
-        if self._method in OFFLINE and out.attitude_cov is not None:  # forward over all samples
+        if self._is_offline and out.attitude_cov is not None:  # forward over all samples
             begin, cov = 0, out.attitude_cov[:begin].copy()
-        _run(filter_, self._records[name], (gyro_S[begin:], accel_S[begin:]), out.take(slice(begin, None)))
+        _run(self._filter, self._records[name], (gyro_S[begin:], accel_S[begin:]), out.take(slice(begin, None)))
         if cov is not None and out.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
             out.attitude_cov[: len(cov)] = cov
@@ -163,7 +162,7 @@ class SensorFilters:
         self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float, out: Orientation
     ) -> int:
         """Start the filter; fill `out` before its first sample by filtering backward, and return that sample."""
-        noise, filter_, params = self._noises[name], METHODS[self._method], self._params
+        noise, filter_, params = self._noises[name], self._filter, self._params
         phase = self._start or slice(0, self._test.samples(rate_hz))
         quat_VS, tilt_std = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
         if self._start is None:  # the sensor may move there
@@ -174,7 +173,7 @@ class SensorFilters:
             params = replace(params, gyro_range=gyro_range)
         static_records, first = make_static_records(noise, rate_hz, self._test), int(phase.start)
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
-            backward = METHODS[BEST] if self._method in OFFLINE else filter_
+            backward = METHODS[BEST] if self._is_offline else filter_
             mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
             start = rotations.turned(quat_VS, _find_turn(gyro_S[first] - noise.gyro_bias, rate_hz))
             static = tuple(record.copy() for record in static_records)
@@ -188,7 +187,7 @@ class SensorFilters:
             out.gyro_bias[:first] *= -1.0
             if out.about_vertical is not None:  # what the backward run has corrected is none of the forward run
                 out.about_vertical[:first] = 0.0
-            if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
+            if self._is_offline:  # forward over all samples, which it alone uses, from the end of that run
                 quat_VS = rotations.turned(run.quat_VS[-1], -_find_turn(gyro_S[0] + run.gyro_bias[-1], rate_hz))
                 params = params if self._params else replace(params, tilt_std=MOVING_TILT_STD)
         self._records[name] = static_records, filter_.make_records(noise, rate_hz, quat_VS, params)

@@ -20,10 +20,9 @@ from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file, find_plugins, load_plugin
 from ..tracking import TrackResult
-from .bvh import write_bvh
-from .c3d import write_c3d
 from .joints import write_lerobot, write_mcap, write_rosbag, write_rrd
 from .motion import ROBOT_URDF, TRAJECTORY, HasJointMotion, check_rate, convert_person, read_joint_motion, resample
+from .motion_capture import write_bvh, write_c3d
 from .opensim import write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
 

@@ -102,7 +102,7 @@ def _list_messages(motion: JointMotion, types: Any) -> Iterator[tuple[str, int, 
     yield "/robot_description", stamps[0], types["std_msgs/msg/String"](data=motion.urdf)
     yield "/tf_static", stamps[0], make_transforms(stamps[0], still, 0)
     joints = list(motion.moving)
-    position, velocity = (np.stack([get(joint) for joint in joints], axis=1) for get in (motion.values, motion.rates))
+    position, velocity = np.stack([motion.values(joint) for joint in joints], axis=2)
     for k, stamp in enumerate(stamps):
         state = types["sensor_msgs/msg/JointState"]
         yield "/joint_states", stamp, state(make_header(stamp, ""), joints, position[k], velocity[k], np.empty(0))
@@ -136,7 +136,7 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
         recording.log(f"body/{rr.escape_entity_path_part(link)}/{k}", mesh, static=True)
     for joint in motion.moving:
         entity = f"joints/{rr.escape_entity_path_part(joint)}"
-        recording.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=motion.values(joint)))
+        recording.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=motion.values(joint)[0]))
     recording.flush()
     recording.disconnect()
 

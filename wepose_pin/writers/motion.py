@@ -159,17 +159,12 @@ class JointMotion:
         """All joints of one axis that copy no other, also those that stay, in the order of `ordered`."""
         return tuple(joint.name for joint in self.ordered if joint.type in _ONE_AXIS and joint.mimic is None)
 
-    def values(self, joint: str) -> np.ndarray:
-        """Return the positions (n,) of a joint [rad or m]."""
-        if joint in self.joints:
-            return np.asarray(self.position[:, self.joints.index(joint)])
-        return np.full(len(self.time), self.posture.get(joint, 0.0))
-
-    def rates(self, joint: str) -> np.ndarray:
-        """Return the velocities (n,) of a joint [rad/s or m/s]."""
-        if joint in self.joints:
-            return np.asarray(self.velocity[:, self.joints.index(joint)])
-        return np.zeros(len(self.time))
+    def values(self, joint: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions (n,) of a joint [rad or m], and its velocities."""
+        if joint not in self.joints:
+            return np.full(len(self.time), self.posture.get(joint, 0.0)), np.zeros(len(self.time))
+        k = self.joints.index(joint)
+        return self.position[:, k], self.velocity[:, k]
 
     def samples(self, interval: tuple[float, float]) -> slice:
         """Return the samples after the approach that follow an interval [s] of the recording."""
@@ -232,7 +227,7 @@ def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
             source, factor, offset = joint.name, 1.0, 0.0
             if joint.mimic is not None:
                 source, factor, offset = joint.mimic.joint, joint.mimic.multiplier or 1.0, joint.mimic.offset or 0.0
-            along = (factor * motion.values(source) + offset)[:, None] * joint_axis(joint)
+            along = (factor * motion.values(source)[0] + offset)[:, None] * joint_axis(joint)
             quat, p = np.repeat(quat, len(along), axis=0), np.repeat(p, len(along), axis=0)
             if joint.type == "prismatic":
                 p = p + along @ origin[:3, :3].T
