@@ -240,11 +240,18 @@ def test_a_start_pose_that_turns_from_its_first_sample_on_is_refused() -> None:
 # Arrays ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("signals", "since"), [("gyro", 0.0), ("gyro accel", 9.0), ("accel", 9.0)])
-def test_arrays_of_a_sensor_that_does_not_measure_are_refused(signals: str, since: float, made: Simulation) -> None:
-    sensor = stopped(made.recording("stopped"), signals, since).sensors[BROKEN]
+@pytest.mark.parametrize(
+    ("signals", "since", "rate_hz"),
+    [("gyro", 0.0, RATE), ("gyro accel", 9.0, RATE), ("accel", 9.0, RATE), ("gyro accel", 9.0, 10.0)],
+)
+def test_arrays_of_a_sensor_that_does_not_measure_are_refused(
+    signals: str, since: float, rate_hz: float, made: Simulation
+) -> None:
+    sensor = (
+        stopped(made.recording("stopped"), signals, since).sensors[BROKEN].part(slice(None, None, int(RATE / rate_hz)))
+    )
     with pytest.raises(WeposeError, match=rf"^{signals.split()[0]}.* stands? still.* from {since:g} to .* leave"):
-        estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, static=(0.5, 4.5))
+        estimate_orientation(sensor.gyro_S, sensor.accel_S, rate_hz, static=(0.5, 4.5))
 
 
 # Lost samples are not measured ones --------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from .faults import (
     MOST_REPEATS,
     NOISY_HZ,
     NOISY_S,
+    NOISY_SHARE,
     SATURATION,
     count_turns,
     is_same,
@@ -207,7 +208,7 @@ def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, ou
             sensor.counts[BAD] += 1
             continue
         if not sensor.is_orientation and t > sensor.newest:
-            _watch_values(sensors, sensor, sample)
+            _watch_values(clock, sensors, sensor, sample)
         if sensor.frozen and t > sensor.since:
             sensor.counts[FROZEN] += 1
             clock.newest = max(clock.newest, t)
@@ -234,7 +235,7 @@ def _is_plausible(clock, sensor, sample):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
+def _watch_values(clock, sensors, sensor, sample):  # type: ignore[no-untyped-def]
     """Find whether a sensor is frozen at this sample, its newest, and at which rates its gyroscope saturates."""
     t, values = sample[0], sample[1:]
     sensor.newest = t
@@ -253,7 +254,7 @@ def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
     sensor.turns += count_turns(sensor.before, sensor.value, values)
     seconds = t - sensor.second
     if seconds >= 1.0:
-        sensor.noisy_s += sensor.turns > NOISY_HZ * 6.0 * seconds
+        sensor.noisy_s += sensor.turns > min(NOISY_HZ, NOISY_SHARE / clock.dt) * 6.0 * seconds
         sensor.second, sensor.turns = t, 0
     sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
     watch_saturation(sensor.saturation, sample[1:4], NARROWEST_GYRO_RANGE)

@@ -28,6 +28,7 @@ MOST_REPEATS = 4.0  # times as long as it repeats otherwise
 COARSE = 1e-4  # share of runs of equal rows above so many times the usual length from which the digits are coarse
 # Noise reverses dozens of times a second; smooth motion hardly does.
 NOISY_HZ, NOISY_S = 10.0, 2  # [1/s] mean over the signals, and seconds of it
+NOISY_SHARE = 0.6  # of the samples of a slow sensor: white noise reverses at two thirds of them
 MOVING = 0.5  # [m/s²] standard deviation of an axis of accel of a sensor that moves
 ROUNDING_TURN = 1e-14  # product of two steps [SI] that are rounding
 
@@ -213,15 +214,16 @@ def _may_have_faults(values):  # type: ignore[no-untyped-def]
 def _is_noisy(time, values):  # type: ignore[no-untyped-def]
     """Return whether signals (n, 3) reverse as in noise for `NOISY_S` seconds, without the rows that repeat."""
     older = old = 0  # the last two rows that differ
-    second, turns, noisy_s = time[0], 0, 0
+    begin = turns = noisy_s = 0  # first row and reversals of this second
     for row in range(1, len(time)):
         if is_same(values[old], values[row]):
             continue
         turns += count_turns(values[older], values[old], values[row])
         older, old = old, row
-        if time[row] - second >= 1.0:
-            noisy_s += turns > NOISY_HZ * 3.0 * (time[row] - second)
-            second, turns = time[row], 0
+        if time[row] - time[begin] >= 1.0:
+            least = min(NOISY_HZ * 3.0 * (time[row] - time[begin]), NOISY_SHARE * 3.0 * (row - begin))
+            noisy_s += turns > least
+            begin, turns = row, 0
     return noisy_s >= NOISY_S
 
 
