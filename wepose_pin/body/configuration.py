@@ -41,9 +41,9 @@ def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray], *, 
     return solver.solve(np.stack(list(quat_WL.values()), axis=1))
 
 
-def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
+def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
     """Compute the pose of `model` from segment orientations, as `solve_configuration` takes them."""
-    solver = KinematicsSolver(model, quat_WL, limits=limits)
+    solver = KinematicsSolver(model, quat_WL)
     return solver.solve_chunk(time, np.stack(list(quat_WL.values()), axis=1))
 
 

@@ -15,15 +15,15 @@ from xml.sax.saxutils import escape, unescape
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import BadModel, MissingFile, reason
+from ..errors import BadModel, reason
+from ..libraries import check_file
 
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 
 
 def read_urdf(path: Path) -> Any:
     """The URDF as yourdfpy has it; each joint, shape and inertia states its origin (4, 4)."""
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; a URDF is needed here")
+    check_file(path, "a URDF")
     try:
         # yourdfpy's parser mends broken XML in silence, and reads what entities name, on disk too.
         ElementTree.parse(path)

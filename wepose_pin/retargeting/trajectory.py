@@ -245,9 +245,8 @@ def _run_controller(
 ) -> dict[str, Any]:
     """Follow the hands from rest, and `posture` (n, joints) where they leave joints free; None: the rest posture.
 
-    Return the fields of `Trajectory` from `joint_position` to `report`.
-
-    From the sample `settle` on the robot comes to rest as soon as it has settled; None: it does not.
+    From the sample `settle` on the robot comes to rest as soon as it has settled; None: it does not. Return the fields
+    of `Trajectory` from `joint_position` to `report`.
     """
     robot, n, dt = controller.robot, len(hands[0].weight), controller.dt
     state, states, poses, reports = JointState.at_rest(robot.rest), [], [], []
