@@ -13,11 +13,20 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.rotations import heading
-from wepose_pin.simulation import MILD_PRESET, MTI_3, PEOPLE_PRESET, SIDES, Imperfections, Person
+from wepose_pin.simulation import (
+    MILD_PRESET,
+    MTI_3,
+    PEOPLE_PRESET,
+    SIDES,
+    Imperfections,
+    Person,
+    Simulation,
+    measure_motion,
+    simulate_person,
+)
 from wepose_pin.simulation.motion import Motion, aim_ray
 from wepose_pin.simulation.people import Flaws, place_shoulder
 from wepose_pin.simulation.signals import Wander, make_pulse
-from wepose_pin.simulation.subject import Simulation, measure_motion, simulate_person
 from wepose_pin.tracking import Tracker, TrackResult, track, track_chunks
 from wepose_pin.tracking.headings import HeadingCorrection
 
