@@ -40,7 +40,7 @@ def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, 
     ("old", "new", "text"),
     [
         ("format = 1", "format = 2", "format = 2; this version reads format = 1"),
-        ('up = "+z"', 'up = "z"', r"arm.toml: up = 'z' is not known; .*there is: \+x, -x"),
+        ('up = "+z"', 'up = "z"', r"arm.toml: up = 'z' is not known; .*there is: \+x, \+y"),
         ('up = "+z"', 'up = "+x"', r"arm.toml: up, forward: \+x and \+x lie on one line"),
         (
             'link = "forearm"',

@@ -13,10 +13,10 @@ from ..body.urdf import find_example_data, read_urdf
 from ..documents import Finite, Key, TomlTable, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
 from ..libraries import asset
+from ..recording import AXES
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
-AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
 

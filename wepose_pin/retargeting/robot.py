@@ -12,7 +12,8 @@ from scipy.optimize import minimize
 
 from ..body.urdf import package_folders
 from ..errors import BadModel, WrongOption, native_stderr_muted, one_of, reason
-from .maps import AXES, ArmMap, HandPoint, JointLimit, LinkPoint, RobotMap
+from ..recording import AXES
+from .maps import ArmMap, HandPoint, JointLimit, LinkPoint, RobotMap
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
 MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
