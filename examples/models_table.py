@@ -26,8 +26,8 @@ for path in sys.argv[1:] or [None]:
     residuals = compute_orientation_residuals(body, solve_configuration(body, quat_WL), quat_WL)
 
     print(f"{path or 'the body that comes with the package'}")
-    singles = [name for k, name in enumerate(body.pin.names) if body.pin.nvs[k] == 1]
-    print(f"  {body.pin.nv} degrees of freedom: {len(body.joints)} spherical joints, {len(singles)} of one axis")
+    sizes = list(body.pin.nvs)
+    print(f"  {body.pin.nv} degrees of freedom: {sizes.count(3)} spherical joints, {sizes.count(1)} of one axis")
     print(f"  mass {sum(inertia.mass for inertia in body.pin.inertias):.2f} kg")
     print("  lengths [m]  " + "  ".join(f"{name} {length:.3f}" for name, length in body.lengths.items()))
     for segment, chain in body.chains.items():
