@@ -11,6 +11,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from ..body.kinematics import find_columns
 from ..compilation import compiled
 from ..errors import BadModel
 from .robot import TABLE_NAME, Robot
@@ -69,8 +70,7 @@ class CollisionModel:
         self._range = radius[self._first] + radius[self._second] + NEAR
         self._supports = np.zeros((robot.model.njoints, robot.model.nv))  # 1: the joint moves by that velocity
         for joint in range(1, robot.model.njoints):
-            self._supports[joint] = self._supports[robot.model.parents[joint]]
-            self._supports[joint, robot.model.idx_vs[joint]] = 1.0
+            self._supports[joint, find_columns(robot.model, robot.model.supports[joint].tolist()[1:])] = 1.0
         # Hulls closer than the clearance in the rest posture keep half of their distance there, or their overlap.
         rest = self.compute_distances(robot.rest, np.arange(len(self.pairs)))
         self.clearance = np.minimum(CLEARANCE, np.where(rest > 0.0, 0.5 * rest, rest))

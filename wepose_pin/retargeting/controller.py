@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..arguments import NonNegative
+from ..body.kinematics import find_columns
 from ..compilation import compiled
 from ..errors import WeposeError
 from .collision import NEAR, CollisionModel, NearPairs
@@ -251,10 +252,8 @@ class _ArmTasks:
     def _view(self, robot: Robot, index: int) -> tuple[Any, Any, Any, Any, np.ndarray]:
         """Return a frame's placement on its joint, that of the joint, and a mask (nv,) of the joints that move it."""
         frame, mask = robot.model.frames[index], np.zeros(robot.model.nv)
-        on_joint, of_joint, joint = frame.placement, self._data.oMi[frame.parentJoint], frame.parentJoint
-        while joint > 0:
-            mask[robot.model.idx_vs[joint]] = 1.0
-            joint = robot.model.parents[joint]
+        on_joint, of_joint = frame.placement, self._data.oMi[frame.parentJoint]
+        mask[find_columns(robot.model, robot.model.supports[frame.parentJoint].tolist()[1:])] = 1.0
         return on_joint.rotation.copy(), on_joint.translation.copy(), of_joint.rotation, of_joint.translation, mask
 
     def update_pose(self) -> ArmPose:

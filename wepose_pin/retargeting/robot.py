@@ -141,10 +141,8 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
         for key, point in arm._asdict().items():
             if isinstance(point, LinkPoint | HandPoint):
                 robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
-        joint, chain = full.frames[full.getFrameId(arm.hand.link)].parentJoint, set[str]()
-        while joint > 0:
-            chain.add(full.names[joint])
-            joint = full.parents[joint]
+        hand = full.frames[full.getFrameId(arm.hand.link)].parentJoint
+        chain = {full.names[joint] for joint in full.supports[hand].tolist()}
         for name in arm.joints:
             robot.check_name(where, "moving joint", name, limits)
             mimics = {joint: limit.mimic[0] for joint, limit in limits.items() if limit.mimic is not None}

@@ -99,12 +99,9 @@ def place_beside_person(robot: Robot, shoulder_z: float, floor_z: float) -> tupl
 
 def _choose_colour(robot: Robot, joint: int) -> tuple[float, float, float, float]:
     """The colour of the arm that moves a joint."""
-    while joint > 0:
-        for arm in robot.arms:
-            if any(robot.names[j] == robot.model.names[joint] for j in arm.joints):
-                return LEFT if arm.side == "left" else RIGHT
-        joint = robot.model.parents[joint]
-    return BODY
+    carriers = reversed(robot.model.supports[joint].tolist())
+    sides = [arm.side for carrier in carriers for arm in robot.arms if carrier - 1 in arm.joints]
+    return BODY if not sides else LEFT if sides[0] == "left" else RIGHT
 
 
 def _join(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
