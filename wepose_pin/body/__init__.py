@@ -15,6 +15,7 @@ which make a `Pose`; `kinematics` has that, places links and points and says how
 from .body import BodyModel as BodyModel
 from .body import load_model as load_model
 from .table import DEFAULT_BODY as DEFAULT_BODY
+from .table import ROOT as ROOT
 from .table import SEXES as SEXES
 from .table import BodyTable as BodyTable
 from .table import Limb as Limb
