@@ -16,16 +16,7 @@ from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import Finite, Key, TomlTable, format_value, is_number, read_record, read_toml, toml_key
 from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printable
-from ..recording import (
-    CONFIGURATION,
-    ImuSensor,
-    OrientationSensor,
-    Recording,
-    Sensor,
-    clocks,
-    compute_mount,
-    read_axes,
-)
+from ..recording import CONFIGURATION, ImuSensor, OrientationSensor, Recording, Sensor, clocks, compute_mount, read_axes
 from ..recording.clocks import TIME_UNITS, Clock
 from ..recording.faults import Fault, check_sensors
 from ..recording.intervals import Intervals, check_phases, find_runs, format_span

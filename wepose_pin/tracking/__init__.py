@@ -26,15 +26,7 @@ if TYPE_CHECKING:
 else:  # checked as the subject that it has; the room of calibrations loads slowly
     Calibration = Subject
 
-__all__ = [
-    "CHUNK_S",
-    "TrackResult",
-    "TrackSummary",
-    "Tracker",
-    "summarize",
-    "track",
-    "track_chunks",
-]
+__all__ = ["CHUNK_S", "TrackResult", "TrackSummary", "Tracker", "summarize", "track", "track_chunks"]
 
 
 def track(
