@@ -11,7 +11,6 @@ three-dimensional motions: application to the knee", Journal of Biomechanical En
 from .joints import AUTO as AUTO
 from .joints import JOINTS as JOINTS
 from .joints import NEAR_LOCK as NEAR_LOCK
-from .joints import SHOULDER_SEQUENCES as SHOULDER_SEQUENCES
 from .joints import Angles as Angles
 from .joints import JointAngles as JointAngles
 from .joints import diagnose_lock as diagnose_lock

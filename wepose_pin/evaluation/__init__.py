@@ -1,11 +1,7 @@
 """How wrong a pose is against a reference, which may have a clock, a world and frames of its own."""
 
-from .registration import Registration as Registration
 from .registration import register as register
 from .scores import AttitudeError as AttitudeError
 from .scores import Evaluation as Evaluation
-from .scores import PositionError as PositionError
-from .scores import angle_error as angle_error
 from .scores import attitude_error as attitude_error
 from .scores import evaluate as evaluate
-from .scores import uncertainty as uncertainty
