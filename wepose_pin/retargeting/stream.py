@@ -227,11 +227,7 @@ class CommandStream:
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        rate_hz: float = 100.0,
-        hold_after: float = HOLD_AFTER_S,
-        stop_after: float = STOP_AFTER_S,
+        self, robot: Robot, rate_hz: float = 100.0, hold_after: float = HOLD_AFTER_S, stop_after: float = STOP_AFTER_S
     ) -> None:
         if not 10.0 <= rate_hz <= 1000.0:
             raise WrongOption("rate-hz", f"{rate_hz:g}", "from 10 to 1000 commands a second")
