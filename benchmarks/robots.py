@@ -15,8 +15,8 @@ import numpy as np
 import polars as pl
 
 from wepose_pin.body.kinematics import Pose
+from wepose_pin.commands.recordings import track
 from wepose_pin.commands.retarget import retarget
-from wepose_pin.commands.track import track
 from wepose_pin.errors import BadOption
 from wepose_pin.retargeting import (
     ROBOTS,

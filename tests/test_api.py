@@ -24,7 +24,7 @@ from arms import write_arm
 import wepose_pin as wp
 from wepose_pin import Simulation
 from wepose_pin.commands import main
-from wepose_pin.commands.track import track as track_session
+from wepose_pin.commands.recordings import track as track_session
 from wepose_pin.recording import find_mount_axes
 from wepose_pin.writers import write_session
 

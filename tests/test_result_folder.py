@@ -11,8 +11,8 @@ import polars as pl
 import pytest
 
 from wepose_pin import ExistingOutput, load_model, population_subject, simulate
-from wepose_pin.commands.calibrate import calibrate as calibrate_session
-from wepose_pin.commands.track import track as track_session
+from wepose_pin.commands.recordings import calibrate as calibrate_session
+from wepose_pin.commands.recordings import track as track_session
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import write_subject
 

@@ -154,7 +154,9 @@ else:  # cyclopts collects the values of an option that is given several times o
 # In the order of `wepose --help`; each is imported when it is needed.
 COMMANDS = {
     "demo": "wepose_pin.commands.simulate:demo",
-    **{name: f"wepose_pin.commands.{name}:{name}" for name in ("info", "simulate", "calibrate", "track")},
+    "info": "wepose_pin.commands.recordings:info",
+    "simulate": "wepose_pin.commands.simulate:simulate",
+    **{name: f"wepose_pin.commands.recordings:{name}" for name in ("calibrate", "track")},
     **{name: f"wepose_pin.commands.results:{name}" for name in ("view", "evaluate", "angles", "export")},
     **{name: f"wepose_pin.commands.{name}:{name}" for name in ("retarget", "live")},
     "batch": "wepose_pin.batch.command:batch",

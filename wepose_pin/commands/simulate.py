@@ -9,10 +9,9 @@ from typing import Annotated, Any, Literal
 
 from ..errors import BadOption, one_of
 from . import options as opt
-from .calibrate import calibrate
 from .output import progress_bar, say
+from .recordings import calibrate, track
 from .results import evaluate
-from .track import track
 
 PROTOCOL, SHORT_PROTOCOL = "clasp+t_pose", "clasp"
 LEAST_S = 30.0  # from which on there is time for the T-pose
