@@ -16,11 +16,12 @@ from functools import partial
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from ..body.kinematics import Pose
 from ..errors import BadData
 from ..recording import AXES
+from ..recording.clocks import interpolate
 from ..rotations import conjugate, multiply
 
 FITTED = 1.0 / 3.0  # share of the time that is not scored
@@ -210,11 +211,7 @@ def sample(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     known, spanned = time[good], _is_spanned(time[good], at)
     sampled = np.full((len(at), values.shape[1]), np.nan)
     if spanned.any():
-        at = np.clip(at[spanned], known[0], known[-1])
-        if values.shape[1] == 4:
-            sampled[spanned] = Slerp(known, Rotation.from_quat(values[good]))(at).as_quat()
-        else:
-            sampled[spanned] = np.column_stack([np.interp(at, known, axis) for axis in values[good].T])
+        sampled[spanned] = interpolate(known, values[good], at[spanned])
     return sampled
 
 

@@ -15,7 +15,7 @@ from ..body import load_table
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, one_of
 from ..libraries import library_errors
-from ..recording.clocks import spread_equal_times
+from ..recording.clocks import interpolate, spread_equal_times
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
 
@@ -142,7 +142,7 @@ def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray,
         raise BadData(f"{place}: {name} and {other} have no time in common, of {len(time)} and {len(own)} rows")
     time, rates = time[inside], rates[inside]
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
-    joined = np.column_stack([np.interp(time, own, axis) for axis in forces.T])
+    joined = interpolate(own, forces, time)
     far = own[after] - own[after - 1] > LONGEST_STEPS * np.median(np.diff(own))
     joined[far & (time != own[after]) & (time != own[after - 1])] = np.nan
     return time, {name: rates, other: joined}

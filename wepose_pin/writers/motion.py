@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..body import BodyModel
@@ -24,6 +24,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile, WrongOption
 from ..libraries import library_errors
 from ..recording import Intervals, select_interval
+from ..recording.clocks import interpolate
 from ..rotations import multiply
 from ..tracking import TrackResult
 from .result import read_phases
@@ -70,7 +71,7 @@ def resample(motion: TrackResult, rate_hz: float) -> TrackResult:
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])
     w, first, last = share[:, None, None], share < 1.0 - 1e-6, share > 1e-6  # samples to which the old ones contribute
-    quat_WL = {name: Slerp(old, Rotation.from_quat(quat))(time).as_quat() for name, quat in pose.quat_WL.items()}
+    quat_WL = {name: interpolate(old, quat, time) for name, quat in pose.quat_WL.items()}
     parts: dict[str, Any] = {
         name: {each: (1.0 - w) * cov[after - 1] + w * cov[after] for each, cov in getattr(pose, name).items()}
         for name in ("segment_cov", "point_cov")
