@@ -15,7 +15,7 @@ from ..body.subject import Subject, load_subject, population_subject, subject_to
 from ..body.table import NEUTRAL_POSE
 from ..documents import format_value, read_toml, toml_key, whole_file
 from ..errors import BadSession
-from ..readers.session import SensorKeys, read_head, read_sensor_keys, read_session_file
+from ..readers import SensorKeys, read_head, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from ..recording.arrivals import Samples
 from .sources import Source

@@ -27,13 +27,13 @@ from ..recording import AXES, CONFIGURATION, ImuSensor, Recording, compute_rate
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.intervals import Intervals, find_runs, format_span, format_time
 from ..recording.limits import LONGEST_STEP_S
+from . import format_keys, read_session
 from .arrays import ArrayFile, is_array_file
 from .device import Device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .reference import read_reference
 from .registry import detect_format, look_up_format, read_device
-from .session import format_keys, read_session
 
 # A line of a file that says its rate.
 _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,12}(?P<rate>\d+(\.\d+)?)", re.IGNORECASE)

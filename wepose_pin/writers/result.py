@@ -41,7 +41,7 @@ from ..diagnostics import from_json
 from ..documents import toml_key, whole_folder
 from ..errors import ExistingOutput, MissingFile
 from ..libraries import asset, check_file, library_errors
-from ..readers.session import format_keys
+from ..readers import format_keys
 from ..recording import ImuSensor, Intervals, Mark, Recording, find_mount_axes, select_interval
 from ..tracking import TrackResult, TrackSummary
 
