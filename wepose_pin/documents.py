@@ -6,11 +6,10 @@ import json
 import math
 import os
 import re
-import signal
 import tempfile
-import threading
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -294,23 +293,6 @@ def _revert(value: Any, key: Key) -> Any:
 
 
 @contextmanager
-def signals_delayed() -> Iterator[None]:
-    """Ctrl-C and SIGTERM take effect when the block has ended."""
-    came: list[int] = []
-    handlers: dict[int, Any] = {}
-    if threading.current_thread() is threading.main_thread():  # no other one is interrupted
-        for each in (signal.SIGINT, signal.SIGTERM):
-            handlers[each] = signal.signal(each, lambda number, _frame: came.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-        for number in came[:1]:
-            signal.raise_signal(number)
-
-
-@contextmanager
 def whole_folder(out: Path, force: bool = False, earlier: Sequence[str] = ()) -> Iterator[Path]:
     """Create a new folder to write into; its files move to `out` when the block succeeds, and are deleted otherwise.
 
@@ -337,15 +319,19 @@ def whole_folder(out: Path, force: bool = False, earlier: Sequence[str] = ()) ->
         for path, target in targets.items():
             if target.exists() and target.is_dir() != path.is_dir():
                 raise ExistingOutput(f"{target}: is in the way; nothing was written, move it or name another folder")
-        with signals_delayed():
-            if out.exists():
-                for path in {path for pattern in earlier for path in out.glob(pattern)} - {*targets.values()}:
-                    path.unlink()
-                for path, target in targets.items():
-                    target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
-            else:
-                out.parent.mkdir(parents=True, exist_ok=True)
-                partial.rename(out)
+        with ThreadPoolExecutor(1) as thread:  # in which no signal interrupts it
+            thread.submit(_move_files, targets, partial, out, earlier).result()
+
+
+def _move_files(targets: Mapping[Path, Path], partial: Path, out: Path, earlier: Sequence[str]) -> None:
+    if not out.exists():
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial.rename(out)
+        return
+    for path in {path for pattern in earlier for path in out.glob(pattern)} - {*targets.values()}:
+        path.unlink()
+    for path, target in targets.items():
+        target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
 
 
 def _check_folder(out: Path, force: bool, prefix: str) -> None:

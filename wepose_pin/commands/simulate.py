@@ -144,8 +144,6 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
     seed
         Generate a random person and motion from this seed.
     """
-    from ..documents import signals_delayed
-
     session, subject, result = parts = [out / name for name in ("session", "subject", "result")]
     new = [folder for folder in (out, *parts) if not folder.exists()]
     replaced = [folder for folder in parts if force and folder.is_dir()]
@@ -163,10 +161,9 @@ def demo(*, out: opt.Out = Path("wepose-demo"), seed: opt.Seed = 1, force: opt.F
             say("")
             evaluate(result, session, phase="circles")
         except BaseException:
-            with signals_delayed():  # all parts or none
-                for folder in (*new, *replaced):
-                    shutil.rmtree(folder, ignore_errors=True)
-                for folder in replaced:
-                    (Path(earlier) / folder.name).rename(folder)
+            for folder in (*new, *replaced):  # all parts or none
+                shutil.rmtree(folder, ignore_errors=True)
+            for folder in replaced:
+                (Path(earlier) / folder.name).rename(folder)
             raise
     say(f"Open {result / 'view.html'} to see the motion.")

@@ -27,7 +27,7 @@ from ..body.configuration import KinematicsSolver
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
-from ..documents import whole_file
+from ..documents import whole_folder
 from ..errors import BadOption, WeposeError
 from ..filters import BEST
 from ..readers import load_session
@@ -43,7 +43,6 @@ from .state import Action, GuideView, LivePose, Output, SensorStatus, Stage, Sta
 from .ticks import Recorder, SensorMonitor
 
 STATURE = "stature"  # that may be measured in place of a length
-SUBJECT_FILES = ("subject.toml", "subject.urdf", "calibration.json", "report.html")
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
 FIGURE_RATE_HZ = 30.0
 MOTION_S = 14.0  # [s] of the motion of a protocol's part; it is drawn again and again
@@ -232,12 +231,10 @@ class Guide(Stage):
 
     def accept(self, calibration: Calibration, result: Path) -> None:
         """Save the subject of the attempt's calibration, whose files are in the folder `result`, and end."""
-        folder = self.options.folder
-        for name in SUBJECT_FILES:
-            if (result / name).is_file():
-                with whole_file(folder / name, force=True) as file:
-                    shutil.copyfile(result / name, file)
-        write_segments(folder, self.segments)
+        with whole_folder(self.options.folder, force=True, earlier=("report.html",)) as folder:
+            for file in result.glob("*"):
+                shutil.copyfile(file, folder / file.name)
+            write_segments(folder, self.segments)
         self.accepted, self.is_over = calibration, True
 
     def close(self) -> None:

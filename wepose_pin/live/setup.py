@@ -13,7 +13,7 @@ from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.subject import Subject, load_subject, population_subject, subject_toml
 from ..body.table import NEUTRAL_POSE
-from ..documents import format_value, read_toml, toml_key, whole_file
+from ..documents import format_value, read_toml, toml_key
 from ..errors import BadSession
 from ..readers import SensorKeys, read_head, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
@@ -167,5 +167,4 @@ def write_segments(folder: Path, segments: Mapping[str, str]) -> None:
     """Write the setup file that `read_segments` reads."""
     lines = ["format = 1", "", "[sensors]   # name that the source gives it = segment"]
     lines += [f"{toml_key(sensor)} = {format_value(segment)}" for sensor, segment in segments.items()]
-    with whole_file(folder / SETUP_FILE, force=True) as partial:
-        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / SETUP_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
