@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from simulated import SEGMENTS, SUBJECT
 
-from wepose_pin import (
-    IDEAL_PRESET,
-    PEOPLE_PRESET,
-    Imperfections,
-    Simulation,
-    simulate,
-)
+from wepose_pin import IDEAL_PRESET, PEOPLE_PRESET, Imperfections, Simulation, simulate
 
 SHORTER = {"clasp_s": 5.0, "circles": 0, "rate_hz": 30.0}
 # Of the body: imperfection -> it turns segments, and not only sensors on them.

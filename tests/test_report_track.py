@@ -21,13 +21,7 @@ from wepose_pin.report.pages import write_track_pages
 from wepose_pin.tracking import summarize
 from wepose_pin.writers import write_session
 
-SECTIONS = [
-    "What was recorded",
-    "Drift of the headings",
-    "The hands",
-    "Joint angles",
-    "The motion in 3D",
-]
+SECTIONS = ["What was recorded", "Drift of the headings", "The hands", "Joint angles", "The motion in 3D"]
 
 
 def report(result: wp.TrackResult) -> str:
