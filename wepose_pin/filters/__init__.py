@@ -133,9 +133,9 @@ class SensorFilters:
 
         A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
         """
-        if np.shape(gyro_S) != self.gyro_bias.shape or np.shape(accel_S) != self.gyro_bias.shape:
-            raise BadData(f"gyro_S {np.shape(gyro_S)} and accel_S {np.shape(accel_S)}: {len(self.names)} rows of three")
-        gyro_S, accel_S = (np.ascontiguousarray(each, dtype=float) for each in (gyro_S, accel_S))
+        gyro_S, accel_S = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
+        if gyro_S.shape != self.gyro_bias.shape or accel_S.shape != self.gyro_bias.shape:
+            raise BadData(f"gyro_S {gyro_S.shape} and accel_S {accel_S.shape}: {len(self.names)} rows of three")
         for i, name in enumerate(self.names):
             _run(self._filter, self._records[name], (gyro_S[i : i + 1], accel_S[i : i + 1]), self._rows[i])
         return self.quat_VS

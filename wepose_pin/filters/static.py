@@ -164,13 +164,17 @@ def _is_within(window, limit, part, share):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _rate_is_steady(state, model, block):  # type: ignore[no-untyped-def]
+def _rate_is_steady(state, model, tail):  # type: ignore[no-untyped-def]
     """Condition (6): the mean rate of the newest part is near that of the window."""
-    anchor, window, newest, M = state.anchor, state.window, model.newest, model.rate_change
-    share = newest / len(block)
-    x, y, z = -share * window[0], -share * window[1], -share * window[2]
-    for at in range(state.samples - newest, state.samples):  # negative: of the block before
-        x, y, z = x + block[at, 0] - anchor[0], y + block[at, 1] - anchor[1], z + block[at, 2] - anchor[2]
+    head, window, newest, M = state.head, state.window, model.newest, model.rate_change
+    begin, share = state.samples - newest, newest / len(tail)  # first sample of the newest part in the block
+    x, y, z = head[0] - share * window[0], head[1] - share * window[1], head[2] - share * window[2]
+    if begin < 0:
+        rest = tail[len(tail) + begin]
+        x, y, z = x + rest[0], y + rest[1], z + rest[2]
+    elif begin > 0:
+        rest = tail[begin - 1]
+        x, y, z = x - rest[0], y - rest[1], z - rest[2]
     across = M[0, 1] * x * y + M[0, 2] * x * z + M[1, 2] * y * z
     return M[0, 0] * x * x + M[1, 1] * y * y + M[2, 2] * z * z + 2.0 * across <= newest * newest
 
@@ -215,6 +219,8 @@ def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ign
         if not state.moves:
             state.moves = _is_far(anchor, limit, block, at)
             _add(head, head, block, at, anchor)
+            # No window needs the sums of the block before from here; those up to here serve condition (6).
+            tail[at, 0], tail[at, 1], tail[at, 2] = head[0], head[1], head[2]
         return -1 if state.moves or state.samples <= state.moves_until else state.samples
     # The block is full and is the window: sum it up backwards, begin the next.
     if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
@@ -259,7 +265,7 @@ def find_static(states, models, block, tail, gyro_S, accel_S, static):  # type: 
                 and window[19] - window[6] * norm <= model.norm_variance  # (4)
                 and _is_within(window, limits[0], 0, share)  # (1)
                 and _is_within(window, limits[1], 1, share)  # (2)
-                and _rate_is_steady(state, model, block)  # (6)
+                and _rate_is_steady(state, model, tail)  # (6)
             ):
                 static[k] = _bias_agrees(state, model, len(block), share)  # (5)
                 continue
