@@ -195,7 +195,8 @@ def _describe(error: CycloptsError, command: str) -> str:
     if isinstance(error, UnusedCliTokensError):
         return f"'{(error.unused_tokens or [''])[0]}' is one word too many for wepose {command}"
     error.verbose = False
-    return str(error).rstrip(".")
+    needs = rf"wepose {command} needs a value for \1"
+    return re.sub('Command ".*" parameter (.*) requires an argument', needs, str(error).rstrip("."))
 
 
 class PlainHelp:
