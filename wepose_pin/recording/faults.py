@@ -265,7 +265,7 @@ def _find_levels(values: np.ndarray, least: float) -> np.ndarray:
     """Find the magnitude (3,) at which each axis of `values` (n, 3) saturates, `least` or more; infinite: none."""
     state, values = start_saturation(), np.ascontiguousarray(values)
     largest = max(values.max(initial=0.0), -values.min(initial=0.0))
-    if _has_plateau(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * largest)):
+    if _may_saturate(values, max(least, (1.0 - SAME_LEVEL) * (1.0 - SAME_RANGE) * largest)):
         _watch_all(state, values, least)
     return np.asarray(state["level"][0])
 
@@ -278,13 +278,11 @@ def start_saturation() -> np.ndarray:
 
 
 @kernel
-def _has_plateau(values, least):  # type: ignore[no-untyped-def]
-    """Return whether an axis has one value, `least` or more, in `SHORT_PLATEAU` rows: most signals never do."""
-    tolerance = 3.0 * ROUNDING * least
-    for row in range(2, len(values)):
+def _may_saturate(values, least):  # type: ignore[no-untyped-def]
+    """Return whether an odd row repeats a value, `least` or more: in a plateau one does, in few other signals."""
+    for row in range(1, len(values), 2):
         for k in range(3):
-            value, before, older = values[row, k], values[row - 1, k], values[row - 2, k]
-            if abs(value - before) <= tolerance and abs(value - older) <= tolerance and abs(value) >= least:
+            if abs(values[row, k] - values[row - 1, k]) <= 2.0 * ROUNDING * least and abs(values[row, k]) >= least:
                 return True
     return False
 
