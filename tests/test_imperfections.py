@@ -22,9 +22,6 @@ def people() -> Simulation:
     return simulate(SUBJECT, seed=5, imperfections=PEOPLE_PRESET, **SHORTER)
 
 
-# Presets and the perfect world -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
@@ -43,12 +40,6 @@ def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:
         Imperfections(**wrong)
     with pytest.raises(ValueError, match="clock_jitter"):
         simulate(SUBJECT, seed=0, imperfections=Imperfections(clock_jitter=0.01), clasp_s=5.0, circles=0)
-
-
-# Sensors ---------------------------------------------------------------------------------------------------------
-
-
-# Switches --------------------------------------------------------------------------------------------------------
 
 
 def sensor_draws(sim: Simulation) -> dict[str, np.ndarray]:
