@@ -28,10 +28,7 @@ class TerminalView(Output):
     """
 
     def __init__(
-        self,
-        file: TextIO | None = None,
-        keyboard: Keyboard | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, file: TextIO | None = None, keyboard: Keyboard | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._file, self._keyboard, self._clock, self._begin = file or sys.stdout, keyboard, clock, clock()
         self._actions: tuple[Action, ...] = ()  # that are offered

@@ -438,10 +438,7 @@ class Tracker:
 
 
 def track_chunks(
-    tracker: Tracker,
-    recording: Recording,
-    chunk_s: float = CHUNK_S,
-    progress: Callable[[float], None] = lambda _: None,
+    tracker: Tracker, recording: Recording, chunk_s: float = CHUNK_S, progress: Callable[[float], None] = lambda _: None
 ) -> Iterator[TrackResult]:
     """Iterate over a recording's chunks with their poses: results of a day that are too long for memory.
 
