@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import refused
 
 from wepose_pin import ImuSensor, Recording, Simulation, WeposeError, estimate_orientation, load_session, track
+from wepose_pin.recording.faults import check_sensors
 from wepose_pin.recording.plausibility import find_unseen_rate
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
@@ -357,3 +358,13 @@ def test_a_mount_off_gravity_may_be_a_start_pose_that_is_another(
         (path / "session.toml").write_text(session)
         line = refused(["track", str(path), "-o", str(tmp_path / "out"), *options], capsys)
         assert "the seconds of the start pose in [phases]" in line
+
+
+@pytest.mark.parametrize("is_imu", [True, False])
+def test_a_sensor_that_is_a_copy_of_another_is_refused(is_imu: bool) -> None:
+    values = np.random.default_rng(1).normal(0.0, 1.0, (100, 3 if is_imu else 4))
+    samples = (np.arange(100) / RATE, *(values,) * (1 + is_imu))
+    with pytest.raises(
+        WeposeError, match=r"^here: sensors\.head and sensors\.torso hold the same values in 100 rows: "
+    ):
+        check_sensors("here", {"head": samples, "torso": samples}, None)

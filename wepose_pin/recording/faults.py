@@ -72,20 +72,21 @@ def check_sensors(
     `samples`: sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost. `start` [s]:
     the stated start pose. `BadData`: two sensors have the same values, or one is dead all along or in the start pose.
     """
-    imus, diagnostics = {}, []
+    imus, orientations, diagnostics = {}, {}, []
     for name, (time, *values) in samples.items():
         good = np.isfinite(np.hstack(values)).all(axis=1)
         if len(values) == 2:
             imus[name] = (time, *values) if good.all() else (time[good], *(each[good] for each in values))
             continue
         known = values[0][good & values[0].any(axis=1)]  # zeros mark a lost sample
+        orientations[name] = time, known
         if len(known) >= FROZEN_SAMPLES and (known == known[0]).all():
             facts: dict[str, float | str] = {"variant": "orientation", "rows": len(known)}
             diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, facts=facts))
-    for (name, a), (other, b) in combinations(imus.items(), 2):
+    for (name, a), (other, b) in (*combinations(imus.items(), 2), *combinations(orientations.items(), 2)):
         if all(map(np.array_equal, a[1:], b[1:])) and np.count_nonzero(~_mark_repeats(*a[1:])) > FROZEN_SAMPLES:
             raise BadData(
-                f"{where}: sensors.{name} and sensors.{other} hold the same values in {len(a[0])} rows: "
+                f"{where}: sensors.{name} and sensors.{other} hold the same values in {len(a[1])} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
             )
     faults = find_faults(imus)

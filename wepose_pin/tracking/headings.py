@@ -32,6 +32,7 @@ class HeadingCorrection:
     errors: np.ndarray  # (m, k) [rad] that are corrected, on the left in W
     covariance: np.ndarray  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
     segment_covariance: np.ndarray  # (m, k, k) [rad²] of the segments' headings
+    filtered: np.ndarray  # (m, k) [rad] by which the orientation filters had corrected their headings by then
 
     @property
     def max_correction_deg(self) -> dict[str, float]:
@@ -39,12 +40,15 @@ class HeadingCorrection:
         largest = np.degrees(np.max(np.abs(self.errors), axis=0, initial=0.0))
         return dict(zip(self.filter.names, largest.tolist(), strict=True))
 
-    def interpolate(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corrections (n, k) [rad] and the variances (n, k) [rad²] of segments' headings at times [s]."""
+    def interpolate(self, time: np.ndarray, filtered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corrections (n, k) [rad] and the variances (n, k) [rad²] of segments' headings at times [s].
+
+        `filtered` (n, k) [rad] is that of the orientation filters at these times: what is interpolated has none of it.
+        """
         variances = np.diagonal(self.segment_covariance, axis1=1, axis2=2)
-        knots = np.hstack([self.errors, variances])
+        knots = np.hstack([self.errors + self.filtered, variances])
         at_times = np.column_stack([np.interp(time, self.time, values) for values in knots.T])
-        return at_times[:, : variances.shape[1]], at_times[:, variances.shape[1] :]
+        return at_times[:, : variances.shape[1]] - filtered, at_times[:, variances.shape[1] :]
 
     def correlate_segments(
         self, time: np.ndarray, segment_cov: Mapping[str, np.ndarray]
@@ -106,6 +110,7 @@ class HeadingCorrector:
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
+        self._filtered: list[np.ndarray] = []  # as of `HeadingCorrection`
         # Of each knot: causally what was corrected, as `HeadingFilter.estimate`; offline x, P, and what led to them.
         self._history: list[tuple[Any, ...]] = []
         self._set_variance(self._estimate()[2])
@@ -142,6 +147,8 @@ class HeadingCorrector:
         quat_WL = rotations.multiply(quat_WS[rows], self.filter.quat_SL)
         self.filter.step(quat_WL, sides, self._clasped[rows], lost, filters)
         last, self._count = self._count - 1, 0
+        if end is not None:
+            self._filtered.append(np.nan_to_num(filters[1]))
         if not self.filter.causal:
             if end is not None:
                 self._history.append((self.filter.x, self.filter.P, self.filter.process))
@@ -197,8 +204,9 @@ class HeadingCorrector:
         """Return what was observed and corrected causally so far; or `knots`, as `HeadingFilter.estimate` each."""
         knots, k = self._history if knots is None else knots, len(self.offset)
         columns = zip(((k,), (k, k), (k, k)), zip(*knots, strict=True) if knots else ((), (), ()), strict=True)
-        values = (np.array(values).reshape(-1, *shape) for shape, values in columns)
-        return HeadingCorrection(self.filter, np.array(self._times), *values)
+        errors, cov, segment_cov = (np.array(values).reshape(-1, *shape) for shape, values in columns)
+        filtered = np.reshape(self._filtered, errors.shape)
+        return HeadingCorrection(self.filter, np.array(self._times), errors, cov, segment_cov, filtered)
 
     def smooth(self, filters: np.ndarray, end: float) -> HeadingCorrection | None:
         """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` (5, k) after the last sample at `end` [s].

@@ -34,7 +34,7 @@ from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import BEST, OFFLINE, Orientation, SensorFilters, average_start, check_method, collect_orientations
-from ..filters.base import HOLD_S, LOST_RATE_STD
+from ..filters.base import HEADING, HOLD_S, LOST_RATE_STD
 from ..filters.phases import BEGINNING_S, find_reference_phases
 from ..filters.static import StaticTest
 from ..recording import ImuSensor, Recording, Sensor, join_recordings
@@ -331,7 +331,11 @@ class Tracker:
         quat_WL, body, covariances = values[2], self._body, {}
         is_smoothed = correction is not None and not self._causal
         if correction is not None and is_smoothed:
-            delta, known = correction.interpolate(chunk.time)
+            filtered = np.zeros(quat_WL.shape[:2])
+            for name, each in orientation.items():
+                if each.about_vertical is not None:
+                    filtered[:, self.names.index(name)] = each.about_vertical[:, HEADING]
+            delta, known = correction.interpolate(chunk.time, filtered)
             variance = np.stack([known, np.full(known.shape, np.inf), delta**2], axis=2)
             variance[:, self._measured] = np.nan
             quat_WL = rotations.multiply(rotations.rotation_about(E_Z, delta), quat_WL)
