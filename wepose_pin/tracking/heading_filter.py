@@ -121,7 +121,7 @@ class HeadingFilter:
     ----------
     pairs, hinges, palms : joints between two sensors, hinges, and the points that the phase `CLASP` joins
     is_observed : whether one of them tells of the headings
-    start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
+    start_var, mount_cov : (k,), (k, k) [rad²] of headings at the end of the start pose, by the pose and by the mounts
     stride : sensors' samples from one sample of a knot to the next
     x, P : (n,), (n, n); the first k are δ [rad]
     process : how x changes in the last knot besides what it does by itself, the variance of that; (n,) each; and the

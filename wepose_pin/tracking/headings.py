@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from tempfile import SpooledTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..observations import BAND_HZ, compute_sides
 from .heading_filter import HeadingFilter, symmetric
 
 E_Z = np.array([0.0, 0.0, 1.0])
+MOST_IN_MEMORY = 2**27  # [bytes] of the states of knots; more are in a temporary file
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,10 @@ class HeadingCorrector:
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
         self._filtered: list[np.ndarray] = []  # as of `HeadingCorrection`
-        # Of each knot: causally what was corrected, as `HeadingFilter.estimate`; offline x, P, and what led to them.
-        self._history: list[tuple[Any, ...]] = []
+        # Of each knot causally: what was corrected, as `HeadingFilter.estimate`.
+        self._history = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
+        # Offline: x, P, and what led to them; of a day 2 GB.
+        self._states = SpooledTemporaryFile(MOST_IN_MEMORY)  # noqa: SIM115 - it lives as long as this
         self._set_variance(self._estimate()[2])
 
     @property
@@ -151,7 +155,8 @@ class HeadingCorrector:
             self._filtered.append(np.nan_to_num(filters[1]))
         if not self.filter.causal:
             if end is not None:
-                self._history.append((self.filter.x, self.filter.P, self.filter.process))
+                knot = self.filter.x, self.filter.P, *self.filter.process
+                self._states.write(np.concatenate([values.ravel() for values in knot]).tobytes())
                 self._times.append(end - 0.5 * last / self.filter.sensor_rate_hz)
             return
         errors, covariance, segment_covariance = self._estimate()
@@ -218,10 +223,11 @@ class HeadingCorrector:
             self.close(filters, end)
         if not self._times:
             return None
-        x, P, process = self._history[-1]
+        x, P, process = self._read_state(len(self._times) - 1)
         care = forward.find_care(x, P)
         estimates = [forward.estimate(x, P, care)]
-        for before_x, before_P, process_before in self._history[-2::-1]:
+        for knot in range(len(self._times) - 2, -1, -1):
+            before_x, before_P, process_before = self._read_state(knot)
             forward.x, forward.P = before_x, before_P
             forward.predict(process)
             gain = np.linalg.solve(forward.P, forward.advance(before_P, process[2])).T
@@ -233,6 +239,14 @@ class HeadingCorrector:
         if measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
             smoothed.errors[:, measured] = 0.0
         return smoothed
+
+    def _read_state(self, knot: int) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Return x, P and `HeadingFilter.process` of a knot."""
+        n, k = len(self.filter.x), len(self.offset)
+        ends = np.cumsum([n, n * n, n, n, k])
+        self._states.seek(8 * ends[-1] * knot)
+        x, P, change, variance, turn = np.split(np.frombuffer(self._states.read(8 * ends[-1])), ends[:-1])
+        return x, P.reshape(n, n), (change, variance, turn)
 
 
 def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
