@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from commands import run
 
 from wepose_pin import Simulation, Subject, WeposeError, calibrate, simulate, track
 from wepose_pin.simulation import Person
-from wepose_pin.tracking import Tracker, track_chunks
+from wepose_pin.tracking import Tracker, TrackSummary, track_chunks
 from wepose_pin.writers import write_session
 
 
@@ -57,6 +58,14 @@ def test_an_open_loop_in_chunks_is_the_whole(made: Simulation, subject: Subject)
     chunks = list(track_chunks(Tracker(subject, open_loop=True), made.recording(), 30.0))
     for name, quat in whole.quat_WL.items():
         assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat)
+
+
+def test_a_summary_keeps_no_chunk_in_memory(made: Simulation) -> None:
+    recording, passed = made.recording(), list[weakref.ref[np.ndarray]]()
+    for tracked in TrackSummary(recording).accumulate(track_chunks(Tracker(), recording, 10.0)):
+        passed.append(weakref.ref(tracked.pose.point_cov["right_palm"]))
+    assert len(passed) > 4
+    assert not any(values() is not None for values in passed[:-1])
 
 
 def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:

@@ -7,6 +7,7 @@ Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is correct
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -117,6 +118,7 @@ class HeadingCorrector:
         self._history = list[tuple[np.ndarray, np.ndarray, np.ndarray]]()
         # Offline: x, P, and what led to them; of a day 2 GB.
         self._states = SpooledTemporaryFile(MOST_IN_MEMORY)  # noqa: SIM115 - it lives as long as this
+        weakref.finalize(self, self._states.close)
         self._set_variance(self._estimate()[2])
 
     @property

@@ -69,7 +69,8 @@ class TrackSummary:
     def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
         """Iterate over chunks, and add each."""
         for tracked in chunks:
-            rows = slice(-self._samples % self._every, None, self._every)
+            # Numbers, since a slice would keep all of a chunk in memory.
+            rows = np.arange(-self._samples % self._every, len(tracked.time), self._every)
             self._poses.append(tracked.pose.cut(rows))
             for segment, orientation in tracked.segments.orientation.items():
                 self._static.setdefault(segment, []).append(orientation.static)
