@@ -62,7 +62,8 @@ def test_an_open_loop_in_chunks_is_the_whole(made: Simulation, subject: Subject)
 
 def test_a_summary_keeps_no_chunk_in_memory(made: Simulation) -> None:
     recording, passed = made.recording(), list[weakref.ref[np.ndarray]]()
-    for tracked in TrackSummary(recording).accumulate(track_chunks(Tracker(), recording, 10.0)):
+    summary = TrackSummary(recording)
+    for tracked in summary.accumulate(track_chunks(Tracker(), recording, 10.0)):
         passed.append(weakref.ref(tracked.pose.point_cov["right_palm"]))
     assert len(passed) > 4
     assert not any(values() is not None for values in passed[:-1])
