@@ -55,14 +55,6 @@ def test_help_reads_like_a_manual(capsys: pytest.CaptureFixture[str], monkeypatc
     assert __version__ in capsys.readouterr().out
 
 
-def test_help_is_grouped(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("track", "--help") == 0
-    text = capsys.readouterr().out
-    groups = ("\nOptions:", "  --subject", "\nMore options:", "  --torques", "\nOptions for research:", "  --open-loop")
-    places = [text.index(word) for word in groups]
-    assert places == sorted(places)
-
-
 @pytest.mark.parametrize("name", ["track", "calibrate", "retarget", "export", "evaluate"])
 def test_a_command_and_its_function_share_their_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Each has one default and one description; the method of `wepose track` may be that of a live session."""
