@@ -345,7 +345,8 @@ def _create_folder(url: str) -> Iterator[Path]:
             folder = Path(temporary) / "whole"  # with the user's usual permissions
             folder.mkdir()
             yield folder
-            shutil.rmtree(place, ignore_errors=True)
+            with contextlib.suppress(FileNotFoundError):
+                place.rename(Path(temporary) / "earlier")  # a killed process leaves no part of it at its place
             folder.rename(place)
         return
     with tempfile.TemporaryDirectory(prefix="wepose-") as temporary:
