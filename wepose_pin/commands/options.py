@@ -108,7 +108,7 @@ def _read_entries(numbers: bool, words: Sequence[Token]) -> dict[str, Any]:
 
 
 Force = Annotated[bool, Parameter(help="Replace the files of an earlier run.")]
-Interval = Annotated[tuple[float, float], Parameter(metavar="FROM TO")]
+Interval = Annotated[tuple[float, float], Parameter(metavar="FROM TO"), _checked_by("recording.intervals:check_order")]
 Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
 OutFile = Annotated[Path, Parameter(alias="-o", metavar="FILE")]
 Subject = Annotated[Path, Parameter(metavar="SUBJECT")]

@@ -56,6 +56,13 @@ def _is_beyond(time: np.ndarray, first: float, last: float) -> bool:
     return bool(first < time[0] - slack or last > time[-1] + slack)
 
 
+def check_order(interval: tuple[float, float]) -> None:
+    """Raise `WrongOption` where an interval [s] does not run forwards."""
+    if not interval[0] < interval[1]:
+        shown = f"{format_time(interval[0])} {format_time(interval[1])}"
+        raise WrongOption("interval", shown, "two times in seconds are needed, the earlier one first")
+
+
 def select_interval(
     time: np.ndarray,
     phases: Mapping[str, Sequence[tuple[float, float]]],
@@ -68,9 +75,8 @@ def select_interval(
     the second. `WrongOption`: both are given; the interval is empty or outside the recording; no such phase or number.
     """
     if interval is not None:
+        check_order(interval)
         shown = f"{format_time(interval[0])} {format_time(interval[1])}"
-        if not interval[0] < interval[1]:
-            raise WrongOption("interval", shown, "two times in seconds are needed, the earlier one first")
         if phase is not None:
             raise WrongOption("interval", shown, f"--phase {phase} is given too; only one of them can select the time")
         if _is_beyond(time, *interval):
