@@ -285,7 +285,7 @@ class HeadingFilter:
         self.predict(self.process)
         unreliable, lost_now = lost | self._lost_before, lost  # after a loss the tilt may be wrong
         order = self._find_searched(leaps)
-        tilted, lost = unreliable | ~(filters[4] < SEARCH_TILT_STD**2), lost | self._searched
+        tilted, lost = unreliable | (filters[4] > SEARCH_TILT_STD**2), lost | self._searched
         unreliable = unreliable | self._searched
         palms = self.palms if clasped.any() else None
         if palms is not None and unreliable[[self.names.index(name) for name in palms.segments]].any():
