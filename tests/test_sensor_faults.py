@@ -226,6 +226,15 @@ def test_coarse_digits_and_zeros_at_rest_are_no_fault(tmp_path: Path) -> None:
         assert "sensor-frozen" not in {each.code for each in read.diagnostics}
 
 
+def test_fast_motion_without_noise_between_held_poses_is_measured_at_a_low_rate() -> None:
+    """At 8 Hz the swings reverse as often as noise, and the poses repeat exactly."""
+    time = np.arange(480) / 8.0
+    swing = np.sin(np.pi * (time % 5.0 / 3.0).clip(0.0, 1.0)) ** 2 * np.sin(6.0 * np.pi * time)
+    R = Rotation.from_rotvec(swing[:, None] * [0.3, 0.2, 0.1])
+    gyro_S = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * 8.0])
+    assert len(Recording.from_arrays(8.0, torso=(gyro_S, R.inv().apply([3.0, 3.0, 9.0]))))
+
+
 def test_a_start_pose_that_turns_from_its_first_sample_on_is_refused() -> None:
     rng, time = np.random.default_rng(0), np.arange(2000) / RATE
     rate = np.where(time % 2.0 < 1.0, 0.2, -0.2)

@@ -18,10 +18,10 @@ from .faults import (
     AT_RANGE,
     FROZEN_SAMPLES,
     MOST_REPEATS,
-    NOISY_HZ,
     NOISY_S,
-    NOISY_SHARE,
+    QUIET_TURN,
     SATURATION,
+    are_noise,
     count_turns,
     is_same,
     start_saturation,
@@ -58,6 +58,7 @@ SENSOR = np.dtype(
         ("most_repeats", float),  # the most before; 0: it has never changed
         ("second", float),  # [s] start of this second
         ("turns", np.int64),  # reversals of all signals in this second, without the samples that repeat
+        ("quiet", np.int64),  # those of them by `QUIET_TURN` at most
         ("noisy_s", np.int64),  # number of seconds in which the signals reversed as in noise
         ("saturation", SATURATION),  # of gyro
     ],
@@ -251,11 +252,12 @@ def _watch_values(clock, sensors, sensor, sample):  # type: ignore[no-untyped-de
         return
     if not sensor.frozen:
         sensor.most_repeats = max(sensor.most_repeats, sensor.repeats)
-    sensor.turns += count_turns(sensor.before, sensor.value, values)
+    sensor.turns += count_turns(sensor.before, sensor.value, values, np.inf)
+    sensor.quiet += count_turns(sensor.before, sensor.value, values, QUIET_TURN)
     seconds = t - sensor.second
     if seconds >= 1.0:
-        sensor.noisy_s += sensor.turns > min(NOISY_HZ, NOISY_SHARE / clock.dt) * 6.0 * seconds
-        sensor.second, sensor.turns = t, 0
+        sensor.noisy_s += are_noise(sensor.turns / 6.0, sensor.quiet / 6.0, seconds / clock.dt, seconds)
+        sensor.second, sensor.turns, sensor.quiet = t, 0, 0
     sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
     watch_saturation(sensor.saturation, sample[1:4], NARROWEST_GYRO_RANGE)
     sensor.before[:] = sensor.value

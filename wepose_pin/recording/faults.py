@@ -28,7 +28,9 @@ MOST_REPEATS = 4.0  # times as long as it repeats otherwise
 COARSE = 1e-4  # share of runs of equal rows above so many times the usual length from which the digits are coarse
 # Noise reverses dozens of times a second; smooth motion hardly does.
 NOISY_HZ, NOISY_S = 10.0, 2  # [1/s] mean over the signals, and seconds of it
-NOISY_SHARE = 0.6  # of the samples of a slow sensor: white noise reverses at two thirds of them
+# Of slower sensors, down to `SLOWEST_HZ`: share of the samples, of which white noise reverses two thirds. Fast motion
+# does, too, by more than this product of two steps [SI²].
+SLOWEST_HZ, NOISY_SHARE, QUIET_TURN = 7.0, 0.6, 0.01
 MOVING = 0.5  # [m/s²] standard deviation of an axis of accel of a sensor that moves
 ROUNDING_TURN = 1e-14  # product of two steps [SI] that are rounding
 
@@ -215,16 +217,16 @@ def _may_have_faults(values):  # type: ignore[no-untyped-def]
 def _is_noisy(time, values):  # type: ignore[no-untyped-def]
     """Return whether signals (n, 3) reverse as in noise for `NOISY_S` seconds, without the rows that repeat."""
     older = old = 0  # the last two rows that differ
-    begin = turns = noisy_s = 0  # first row and reversals of this second
+    begin = turns = quiet = noisy_s = 0  # first row and reversals of this second
     for row in range(1, len(time)):
         if is_same(values[old], values[row]):
             continue
-        turns += count_turns(values[older], values[old], values[row])
+        turns += count_turns(values[older], values[old], values[row], np.inf)
+        quiet += count_turns(values[older], values[old], values[row], QUIET_TURN)
         older, old = old, row
         if time[row] - time[begin] >= 1.0:
-            least = min(NOISY_HZ * 3.0 * (time[row] - time[begin]), NOISY_SHARE * 3.0 * (row - begin))
-            noisy_s += turns > least
-            begin, turns = row, 0
+            noisy_s += are_noise(turns / 3.0, quiet / 3.0, row - begin, time[row] - time[begin])
+            begin, turns, quiet = row, 0, 0
     return noisy_s >= NOISY_S
 
 
@@ -238,12 +240,18 @@ def is_same(a, b):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def count_turns(older, old, new):  # type: ignore[no-untyped-def]
-    """Count the signals (k,) that reverse at the middle one of three rows."""
+def count_turns(older, old, new, most):  # type: ignore[no-untyped-def]
+    """Count the signals (k,) that reverse at the middle one of three rows, by at most this product of two steps."""
     turns = 0
     for k in range(len(new)):
-        turns += (new[k] - old[k]) * (old[k] - older[k]) < -ROUNDING_TURN
+        turns += -most <= (new[k] - old[k]) * (old[k] - older[k]) < -ROUNDING_TURN
     return turns
+
+
+@inlined
+def are_noise(turns, quiet, samples, seconds):  # type: ignore[no-untyped-def]
+    """Return whether so many reversals of a signal, and so many of them quiet, are those of noise."""
+    return turns > NOISY_HZ * seconds or (samples >= SLOWEST_HZ * seconds and quiet > NOISY_SHARE * samples)
 
 
 # Saturation -----------------------------------------------------------------------------------------------------------
