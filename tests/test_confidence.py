@@ -13,10 +13,20 @@ from bodies import GIRDLE_ROWS, LENGTHS, TABLE
 from commands import run
 from scipy.spatial.transform import Rotation
 
-from wepose_pin import load_model, population_subject, simulate, simulate_person, track
+from wepose_pin import (
+    joint_angles,
+    load_model,
+    load_result,
+    load_session,
+    population_subject,
+    simulate,
+    simulate_person,
+    track,
+)
 from wepose_pin.body.configuration import compute_pose
 from wepose_pin.body.kinematics import compute_point_covariances
 from wepose_pin.writers import write_session
+from wepose_pin.writers.motion import resample
 
 ARMS = [f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")]
 
@@ -83,6 +93,9 @@ def test_the_columns_of_the_result(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sqrt(trace / 3), full["left_palm_std"])
     assert not [name for name in without.columns if name.endswith("_std")]  # NCF has no covariance
     assert plain["torso_std"].is_finite().all()
+    read, even = load_result(tmp_path / "b"), track(load_session(tmp_path))
+    for other in (read, resample(even, 100.0)):
+        np.testing.assert_allclose(joint_angles(other)["left_elbow"].std, joint_angles(even)["left_elbow"].std)
 
 
 def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:

@@ -32,7 +32,7 @@ def test_segments_that_hang_on_each_other_share_how_exactly_a_person_stood(offse
 
 
 def test_who_repeats_the_tilts_of_the_start_pose_repeats_its_headings() -> None:
-    """As in the recording of the calibration; another start pose is as uncertain as that of people."""
+    """As in the recording of the calibration; another start pose is as uncertain as that of people, also of a reset."""
     simulation = simulate(simulate_person(3).lengths, seed=3, clasp_s=10.0, circles=0)
     recording, order = simulation.recording(), tuple(row for name in simulation.quat_LS for row in mount_rows(name))
     subject = replace(
@@ -45,6 +45,11 @@ def test_who_repeats_the_tilts_of_the_start_pose_repeats_its_headings() -> None:
         cov = tracked.pose.segment_cov["right_upper_arm"][:, 2, 2]
         stds.append(np.degrees(np.sqrt(cov[recording.span(recording.phases["start"][0])].mean())))
     assert np.sqrt(stds[1] ** 2 - stds[0] ** 2) == pytest.approx(7.0, rel=0.05)  # `repeat_std_deg`
+    same = replace(subject, start_pose_offset={name: np.array([0.0, 0.0, 0.01]) for name in simulation.quat_LS})
+    tracked = track(replace(recording, resets=(600,)), same, causal=True)
+    reset = np.searchsorted(tracked.time, recording.time[600])
+    before, after = tracked.pose.segment_cov["right_upper_arm"][reset - 1 : reset + 1, 2, 2]
+    assert np.degrees(np.sqrt(after - before)) > 5.0
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])

@@ -179,10 +179,12 @@ def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np
     """Standard deviations (m,) [rad] of the k-th angle at the second sample of each pair (m, 2) less the first."""
     rows = compute_gradients(pose, name, joint, pairs.ravel())[:, k].reshape(-1, 2, 1, 3)
     variances = np.zeros((2, len(pairs)))  # constant in W, in L
+    shared = pose.find_heading_cov(JOINTS[name].proximal, JOINTS[name].distal)[pairs]  # turns no joint
     for segment in (JOINTS[name].proximal, JOINTS[name].distal):
         if segment == "world" or not len(pairs):
             continue
         cov_W = pose.segment_cov[segment][pairs]
+        cov_W[..., 2, 2] -= np.minimum(shared, cov_W[..., 2, 2])
         R_WL = Rotation.from_quat(pose.quat_WL[segment][pairs.ravel()]).as_matrix().reshape(-1, 2, 3, 3)
         frames = (rows, cov_W), (rows @ R_WL, np.swapaxes(R_WL, 2, 3) @ cov_W @ R_WL)
         for variance, (gradient, cov) in zip(variances, frames, strict=True):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,11 @@ class Pose:
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
     joints: Mapping[str, np.ndarray] = field(default_factory=dict)
     heading_cov: Mapping[tuple[str, str], np.ndarray] = field(default_factory=dict)
+
+    def find_heading_cov(self, *segments: str) -> np.ndarray:
+        """Return the covariance (n,) [rad²] of two segments' headings; zero where it is not known."""
+        known = (shared for pair, shared in self.heading_cov.items() if {*pair} == {*segments})
+        return next(known, np.zeros(len(self.time)))
 
     def __repr__(self) -> str:
         return f"Pose({len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points)"
@@ -125,7 +131,8 @@ def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
     """Build the table of ``pose.parquet``.
 
     ``time``; ``<segment>_qx,_qy,_qz,_qw`` (`quat_WL`) and ``<segment>_std`` [rad]; ``<point>_x,_y,_z`` [m] in W and
-    ``<point>_std`` [m]; with `covariance` ``<name>_cov_xx,_xy,_xz,_yy,_yz,_zz`` of each as well; ``<segment>_gap``.
+    ``<point>_std`` [m]; with `covariance` ``<name>_cov_xx,_xy,_xz,_yy,_yz,_zz`` of each and
+    ``<segment>_<segment>_heading_cov`` [rad²] as well; ``<segment>_gap``.
     A standard deviation is that of one axis, the mean over the three (`compute_axis_std`).
     """
     table = {"time": pose.time}
@@ -139,6 +146,8 @@ def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
                 table[f"{name}_std"] = compute_axis_std(covariances[name])
                 if covariance:
                     table |= {f"{name}_{entry}": covariances[name][:, i, j] for entry, (i, j) in _ENTRIES.items()}
+    if covariance:
+        table |= {f"{a}_{b}_heading_cov": shared for (a, b), shared in pose.heading_cov.items()}
     return pl.DataFrame(table | {f"{segment}_gap": gap for segment, gap in pose.gap.items()})
 
 
@@ -186,7 +195,9 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
         {name: covariances[name] for name in series if name in covariances} for series in (quat_WL, points)
     )
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
-    return Pose(time, quat_WL, points, segment_cov=segment_cov, point_cov=point_cov, gap=gap)
+    pairs = {(a, b): f"{a}_{b}_heading_cov" for a, b in permutations(segment_cov, 2)}
+    shared = {pair: numbers[column] for pair, column in pairs.items() if column in numbers}
+    return Pose(time, quat_WL, points, segment_cov=segment_cov, point_cov=point_cov, gap=gap, heading_cov=shared)
 
 
 # Links -----------------------------------------------------------------------------------------------------------

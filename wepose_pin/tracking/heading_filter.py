@@ -70,6 +70,7 @@ ITERATIONS = 2  # linearizations of an update
 # `FOUND_STD`; only sensors whose tilt is known to `SEARCH_TILT_STD` tell of it.
 SEARCH_STD, FOUND_STD, SEARCH_TILT_STD = np.deg2rad([35.0, 20.0, 8.0])
 CIRCLE = np.deg2rad(np.arange(-180.0, 180.0, 5.0))  # [rad]
+CELL_VAR = np.deg2rad(5.0) ** 2 / 12.0  # [rad²] of a heading between two of these
 PEAK = np.deg2rad(60.0)  # [rad] from the likeliest heading, as far as its peak extends
 TAIL = 4.0  # degrees of freedom of a hinge's error on that circle, whose distribution has long tails
 # A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
@@ -178,17 +179,17 @@ class HeadingFilter:
         # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
         # gyroscope's bias, or the drift of measured orientations.
         self._drift_psd, rate_std = np.full(k, DRIFT_PSD), np.full(k, MEASURED_RATE_STD)
-        self.start_var, again = (
-            np.full(k, REFERENCE_START_STD**2),
-            StartPose(table=model.table, repeat_share=repeat_share),
-        )
+        self.start_var, self._again_var = np.full((2, k), REFERENCE_START_STD**2)
         for i, name in enumerate(self.names):
             if name in noises:  # a gyroscope's white noise may be more
                 gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
                 self._drift_psd[i] = max(DRIFT_PSD, gyro_psd)
                 rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
             if name != model.table.reference:
-                self.start_var[i] = compute_start_heading_var(first, name, subject, again)
+                self.start_var[i], self._again_var[i] = (
+                    compute_start_heading_var(first, name, subject, StartPose(table=model.table, repeat_share=share))
+                    for share in (repeat_share, 1.0)
+                )
         # (k, k) [rad²]; a calibration knows the headings of mounts against each other better than that of each.
         rows = [f"mounts.{name}.z" for name in self.names]
         known_rows = [] if first.remounted else rows
@@ -250,8 +251,12 @@ class HeadingFilter:
         self._last_quat: np.ndarray | None = None  # (1, k, 4) of the last knot
         self._clasped_before = False  # whether the palms were joined in the last knot
 
-    def reset(self, headings: np.ndarray) -> None:
-        """Set δ = s − ε_z (k,) [rad] after a start pose with errors s, with the errors ε_z of mounts."""
+    def reset(self, headings: np.ndarray, *, again: bool = False) -> None:
+        """Set δ = s − ε_z (k,) [rad] after a start pose with errors s, with the errors ε_z of mounts.
+
+        `again`: it is another start pose than that of the calibration, whatever the first one was.
+        """
+        self.start_var = self._again_var if again else self.start_var
         P, start_cov, mount_cov = self.P, np.diag(self.start_var), self.mount_cov
         heading, mount, start = (self._columns[name] for name in ("heading", "mount", "start"))
         self.x[heading], self.x[start] = headings, 0.0
@@ -467,7 +472,7 @@ class HeadingFilter:
             off = wrap_angle(CIRCLE - CIRCLE[np.argmax(probability)])
             in_peak = np.where(np.abs(off) < PEAK, probability, 0.0)
             mean = CIRCLE[np.argmax(probability)] + in_peak @ off / in_peak.sum()
-            variance = probability @ wrap_angle(CIRCLE - mean) ** 2
+            variance = CELL_VAR + probability @ wrap_angle(CIRCLE - mean) ** 2
             turned = wrap_angle(mean - self._turned[i])
             self._turned[i] += turned
             self.x[i] = self.x[other] + relative + turned

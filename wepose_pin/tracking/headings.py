@@ -62,8 +62,6 @@ class HeadingCorrection:
         states less than the heading filter knew, the correlation stays and the covariance shrinks.
         """
         rows, scale = {name: i for i, name in enumerate(self.filter.names) if name in segment_cov}, {}
-        if not len(self.time):
-            return {}
         for name, i in rows.items():
             # As much as the heading is uncertain where the tilt is known may be shared with other segments.
             own = np.linalg.det(segment_cov[name]) / np.linalg.det(segment_cov[name][:, :2, :2])
@@ -97,7 +95,7 @@ class HeadingCorrector:
     Attributes
     ----------
     variance : (3, k) [rad²] after the last knot: variances of each segment's heading and of its filter's alone, and
-        the squared correction of the headings since the start or the last reset
+        the squared correction of the headings since the start or the last reset, with what that is less certain by
     """
 
     def __init__(self, heading_filter: HeadingFilter, offset: np.ndarray) -> None:
@@ -110,6 +108,7 @@ class HeadingCorrector:
         self._quat_VS, self._accel_S = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
         self._clasped = np.zeros(self._size, dtype=bool)
         self._from, self._to, self._at_reset = np.zeros((3, k))
+        self._start_var = self.filter.start_var
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
@@ -194,7 +193,7 @@ class HeadingCorrector:
         """Correct the headings to ψ (k,) [rad] at once, as the person shows them by standing in the start pose."""
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._to - error) / (2.0 * np.pi))
-        self.filter.reset(error)
+        self.filter.reset(error, again=True)
         self._corrects_measured = True
         self._from = self._to = self._at_reset = error
         self._set_variance(self._estimate()[2])
@@ -205,7 +204,8 @@ class HeadingCorrector:
 
     def _set_variance(self, segment_covariance: np.ndarray) -> None:
         left, correction = self._to - self._from, self._to - self._at_reset  # until it has faded in
-        self.variance = np.array([np.diag(segment_covariance) + left**2, self._var_at_knot, correction**2])
+        other = correction**2 + (self.filter.start_var - self._start_var)
+        self.variance = np.array([np.diag(segment_covariance) + left**2, self._var_at_knot, other])
 
     def collect(self, knots: Sequence[tuple[Any, ...]] | None = None) -> HeadingCorrection:
         """Return what was observed and corrected causally so far; or `knots`, as `HeadingFilter.estimate` each."""

@@ -436,6 +436,7 @@ class Tracker:
             self._heading_offset[i] = compute_heading_offset(Rotation.from_quat(recent[:, i]).mean(), R_WS_start)
         if self._headings is None:
             self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
+            self._start_pose = replace(self._start_pose, repeat_share=1.0)
         else:
             self._headings.reset(self._heading_offset)
             self._variance = self._headings.variance

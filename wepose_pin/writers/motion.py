@@ -70,11 +70,11 @@ def resample(motion: TrackResult, rate_hz: float) -> TrackResult:
     time = np.minimum(make_times(old, rate_hz), old[-1])
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])
-    w, first, last = share[:, None, None], share < 1.0 - 1e-6, share > 1e-6  # samples to which the old ones contribute
+    first, last = share < 1.0 - 1e-6, share > 1e-6  # samples to which the old ones contribute
     quat_WL = {name: interpolate(old, quat, time) for name, quat in pose.quat_WL.items()}
     parts: dict[str, Any] = {
-        name: {each: (1.0 - w) * cov[after - 1] + w * cov[after] for each, cov in getattr(pose, name).items()}
-        for name in ("segment_cov", "point_cov")
+        name: {each: ((1.0 - share) * cov[after - 1].T + share * cov[after].T).T for each, cov in covs.items()}
+        for name, covs in ((name, getattr(pose, name)) for name in ("segment_cov", "point_cov", "heading_cov"))
     }
     parts["gap"] = {name: (gap[after - 1] & first) | (gap[after] & last) for name, gap in pose.gap.items()}
     return replace(motion, pose=replace(compute_pose(motion.model, time, quat_WL), **parts))
