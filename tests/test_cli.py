@@ -175,7 +175,7 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["track", "s.toml", "t.toml", "-o", "OUT"], "'t.toml' is one word too many for wepose track"),
         (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),
         (["track", "s.toml", "-o", "OUT", "--method", "ekf"], 'Invalid value "ekf" for --method. Choose from: "amekf"'),
-        (["evaluate", "a", "b", "--interval", "3"], "--interval requires 2 positional arguments. Only got 1"),
+        (["evaluate", "a", "b", "--interval", "3"], "needs 2 values for --interval and not 1"),
         (["simulate", "-o", "OUT", "--rate-hz", "fast"], 'unable to convert "fast" into float; see wepose simulate'),
         (["simulate", "-o", "OUT", "--rate-hz", "nan"], 'Invalid value "nan" for --rate-hz. Must be <= 2000; see'),
         (["evaluate", "a", "b", "--time-offset", "nan"], 'Invalid value "nan" for --time-offset. a number is needed'),
@@ -191,6 +191,7 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["simulate", "-o", "OUT", "--imperfection", "palm_slide=0"], "palm_slip"),
         (["simulate", "-o", "OUT", "--imperfection", "palm_slip=much"], "palm_slip = 'much'; a finite number"),
         (["simulate", "-o", "OUT", "--imperfection", "mount=taped"], "there is: stated, any"),
+        (["simulate", "-o", "OUT", "--imperfection", "bits=9.5"], "bits = 9.5; a whole number at least 0 is needed"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(

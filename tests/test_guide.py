@@ -99,8 +99,11 @@ class Session:
 
 
 def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path: Path) -> None:
+    for name in ("calibration.json", "model.toml"):  # of an earlier body
+        (tmp_path / name).write_text("{}")
     session = Session(tmp_path)
     moments = session.run()
+    assert not (tmp_path / "model.toml").exists()
     assert session.clicks == ["guide-next", "guide-next", "guide-accept"]
     assert session.guide.segments == session.person.worn
     assert [*dict.fromkeys(moment.step for moment in moments)] == [

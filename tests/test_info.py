@@ -311,6 +311,8 @@ def test_a_folder_with_a_file_for_each_sensor(capsys: pytest.CaptureFixture[str]
     for k, segment in enumerate(("left_forearm", "left_upper_arm", "torso")):
         write_swing(tmp_path / f"{segment}.csv", 1.0 + 0.1 * k, "gyr_{}")
     (tmp_path / "a_list.csv").write_text("file,person\ntorso.csv,anna\n")
-    info(capsys, tmp_path, "--write")
-    recording = wp.load_session(tmp_path)
+    session = tmp_path.parent / f"{tmp_path.name}.toml"
+    info(capsys, tmp_path, "-o", str(session))
+    recording = wp.load_session(session)
     assert set(recording.sensors) == {"torso", "left_upper_arm", "left_forearm"}
+    assert recording.name == tmp_path.name

@@ -140,6 +140,7 @@ def test_a_failed_calibration_says_so_and_is_not_tracked(
     assert failed.quality.quality == failed.subject.quality == "fail"
     assert failed.subject.std("left_forearm") >= failed.problem.prior.std("left_forearm")
     assert failed.subject.std("mounts.torso.z") >= np.deg2rad(15.0) - 1e-9
+    assert np.isnan(failed.scale_std)
     assert re.fullmatch(r"Calibration\('simulated': fail; 8 lengths ± \d+ to \d+ mm; first: .+\)", repr(failed))
     assert failed.diagnostics[0] == failed.quality.reasons[0]
     assert "left upper arm and left forearm seem to be exchanged" in failed._repr_html_()

@@ -98,7 +98,8 @@ def _describe_part(hint: Any, limits: Range | None) -> str:
         count = f"{len(parts)} " if origin is tuple and parts and ... not in parts else ""
         item = describe(parts[0]) if parts else "a value"
         return f"a list of {count}" + re.sub(r"^an? ((whole |finite )?\w+)", r"\1s", item)
-    return str(limits or _KINDS.get(origin, (origin, f"an object of class {origin.__name__}"))[1])
+    text = str(limits or _KINDS.get(origin, (origin, f"an object of class {origin.__name__}"))[1])
+    return re.sub("^a (finite )?number", "a whole number", text) if origin is int else text
 
 
 def describe(hint: Any) -> str:
@@ -130,7 +131,7 @@ def check_value(place: str, value: Any, hint: Any, error: type[Exception] = BadO
     part, limits = next((each for each in _split(hint) if _takes(each[0], value)), (None, None))
     parts = get_args(part)
     if part is None or (limits is not None and value not in limits):
-        needed = describe(hint) if part is None else str(limits)
+        needed = describe(hint) if part is None else _describe_part(part, limits)
         raise error(f"{place} = {_show(value)}; {needed} is needed")
     if get_origin(part) is Literal:
         if value not in parts:

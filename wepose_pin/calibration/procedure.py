@@ -166,7 +166,7 @@ def calibrate(
     subject = replace(calibration.subject, quality=quality.quality)
     if any(check.quality == "fail" and not check.diagnostic.code.endswith("-uncertain") for check in quality.checks):
         # Something contradicts the estimate, which its ± does not show.
-        subject = _widen(subject, calibration.problem.prior)
+        subject, calibration = _widen(subject, calibration.problem.prior), replace(calibration, scale_std=float("nan"))
     return replace(calibration, quality=quality, subject=subject)
 
 

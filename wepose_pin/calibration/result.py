@@ -112,7 +112,7 @@ class Calibration:
     problem: CalibrationProblem  # that was solved, without what is not used
     subject: Subject  # calibrated
     effective_sample_size: float  # of the gap
-    scale_std: float  # relative standard deviation of the common scale of all lengths
+    scale_std: float  # relative standard deviation of the common scale of all lengths; NaN: contradicted
     remarks: tuple[Diagnostic, ...]  # what is worth knowing, without what the quality says
     time: np.ndarray  # (n,) [s] of the samples
     gap: np.ndarray  # (n,) [m] size of the gap as estimated; NaN outside of closures

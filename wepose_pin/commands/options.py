@@ -195,8 +195,9 @@ def _describe(error: CycloptsError, command: str) -> str:
     if isinstance(error, UnusedCliTokensError):
         return f"'{(error.unused_tokens or [''])[0]}' is one word too many for wepose {command}"
     error.verbose = False
-    needs = rf"wepose {command} needs a value for \1"
-    return re.sub('Command ".*" parameter (.*) requires an argument', needs, str(error).rstrip("."))
+    begin, text = 'Command ".*" parameter (.*) requires ', str(error).rstrip(".")
+    text = re.sub(f"{begin}an argument", rf"wepose {command} needs a value for \1", text)
+    return re.sub(rf"{begin}(\d+) positional .* got", rf"wepose {command} needs \2 values for \1 and not", text)
 
 
 class PlainHelp:

@@ -27,7 +27,6 @@ from ..body.configuration import KinematicsSolver
 from ..body.subject import load_subject
 from ..calibration import Calibration, Protocol, calibrate, load_protocol
 from ..calibration.protocols import BOW, GUIDED, split_protocol
-from ..documents import whole_folder
 from ..errors import BadOption, WeposeError
 from ..filters import BEST
 from ..readers import load_session
@@ -231,7 +230,7 @@ class Guide(Stage):
 
     def accept(self, calibration: Calibration, result: Path) -> None:
         """Save the subject of the attempt's calibration, whose files are in the folder `result`, and end."""
-        with whole_folder(self.options.folder, force=True, earlier=("report.html",)) as folder:
+        with result_folder(self.options.folder, force=True, pages=("report.html",)) as folder:
             for file in result.glob("*"):
                 shutil.copyfile(file, folder / file.name)
             write_segments(folder, self.segments)

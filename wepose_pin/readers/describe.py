@@ -387,7 +387,7 @@ def _format_session(about: Description, folder: Path, body: BodyTable, model: Pa
     recording, segments = about.recording, list(body.segments)
     static = _find_static_intervals(recording) if recording is not None else []
     in_files = len(about.sensors) > 1 and "file" not in about.data  # one file a sensor: the folder is the recording
-    head = {"name": folder.absolute().name if in_files else about.path.stem}
+    head = {"name": about.path.parent.resolve().name if in_files else about.path.stem}
     if model is not None:
         head["model"] = _relative(model, folder) if model.is_file() else str(model)
     lines = [*format_keys({**head, "start_pose": "n_pose"}), "", "[data]", *format_keys(about.data, about.checks)]

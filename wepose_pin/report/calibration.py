@@ -63,7 +63,8 @@ def _describe_reliance(calibration: Calibration) -> str:
     if stds:
         worst = max(stds, key=stds.__getitem__)
         text = f"Lengths are known to ± {stds[worst]:.0f} mm or better ({plain(worst)})"
-        text += f", their common scale to ± {100 * calibration.scale_std:.1f} %." if chain else "."
+        scale = f", their common scale to ± {100 * calibration.scale_std:.1f} %."
+        text += scale if chain and np.isfinite(calibration.scale_std) else "."
         if calibration.formulation == "paper":
             text += " These ± leave out errors of mounts, headings and soft tissue, and are too small."
     mounts = {name: both for name in subject.mounts if np.isfinite(both := _find_mount_stds(subject, name)).all()}

@@ -143,7 +143,7 @@ def open_source(
     kind: SourceKind | None = load_plugin("sources", name) if name in names and colon else None
     if kind is None or not (rest or name == "slimevr"):
         forms = [load_plugin("sources", each).form for each in names]
-        plugin = "; mti is a plug-in: pip install examples/mti" if name == "mti" else ""
+        plugin = "; mti is a plug-in: pip install examples/mti" if name == "mti" and name not in names else ""
         raise BadOption(f"source '{spec}' is not known; {one_of(forms, name)}{plugin}")
     known = tuple(load_table().segments if segments is None else segments)
     options = SourceOptions(spec, None if sensors is None else tuple(sensors), known, any_name, speed)
