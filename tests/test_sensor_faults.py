@@ -221,7 +221,8 @@ def test_coarse_digits_and_zeros_at_rest_are_no_fault(tmp_path: Path) -> None:
     gyro_S, force = gyro_S + rng.normal(0.0, 0.003, (6000, 3)), R.inv().apply([0.0, 0.0, 9.81])
     coarse = ImuSensor(gyro_S, np.round(10.0 * (force + rng.normal(0.0, 0.01, (6000, 3)))) / 10.0)
     lying = ImuSensor(np.zeros((6000, 3)), [0.0, 0.0, 9.81] + rng.normal(0.0, 0.05, (6000, 3)))
-    for name, sensor in (("coarse", coarse), ("lying", lying)):
+    worn_later = ImuSensor(np.where(time[:, None] < 4.0, 0.0, gyro_S), force + rng.normal(0.0, 0.05, (6000, 3)))
+    for name, sensor in (("coarse", coarse), ("lying", lying), ("worn later", worn_later)):
         read = load_session(written(tmp_path / name, Recording(name, time, 50.0, {"torso": sensor})))
         assert "sensor-frozen" not in {each.code for each in read.diagnostics}
 

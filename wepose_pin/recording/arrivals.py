@@ -19,8 +19,8 @@ from .faults import (
     FROZEN_SAMPLES,
     MOST_REPEATS,
     NOISY_S,
-    QUIET_TURN,
     SATURATION,
+    SMALL_TURN,
     are_noise,
     count_turns,
     is_same,
@@ -58,7 +58,7 @@ SENSOR = np.dtype(
         ("most_repeats", float),  # the most before; 0: it has never changed
         ("second", float),  # [s] start of this second
         ("turns", np.int64),  # reversals of all signals in this second, without the samples that repeat
-        ("quiet", np.int64),  # those of them by `QUIET_TURN` at most
+        ("small", np.int64),  # those of them by `SMALL_TURN` at most
         ("noisy_s", np.int64),  # number of seconds in which the signals reversed as in noise
         ("saturation", SATURATION),  # of gyro
     ],
@@ -253,11 +253,11 @@ def _watch_values(clock, sensors, sensor, sample):  # type: ignore[no-untyped-de
     if not sensor.frozen:
         sensor.most_repeats = max(sensor.most_repeats, sensor.repeats)
     sensor.turns += count_turns(sensor.before, sensor.value, values, np.inf)
-    sensor.quiet += count_turns(sensor.before, sensor.value, values, QUIET_TURN)
+    sensor.small += count_turns(sensor.before, sensor.value, values, SMALL_TURN)
     seconds = t - sensor.second
     if seconds >= 1.0:
-        sensor.noisy_s += are_noise(sensor.turns / 6.0, sensor.quiet / 6.0, seconds / clock.dt, seconds)
-        sensor.second, sensor.turns, sensor.quiet = t, 0, 0
+        sensor.noisy_s += are_noise(sensor.turns / 6.0, sensor.small / 6.0, seconds / clock.dt, seconds)
+        sensor.second, sensor.turns, sensor.small = t, 0, 0
     sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
     watch_saturation(sensor.saturation, sample[1:4], NARROWEST_GYRO_RANGE)
     sensor.before[:] = sensor.value

@@ -28,9 +28,9 @@ MOST_REPEATS = 4.0  # times as long as it repeats otherwise
 COARSE = 1e-4  # share of runs of equal rows above so many times the usual length from which the digits are coarse
 # Noise reverses dozens of times a second; smooth motion hardly does.
 NOISY_HZ, NOISY_S = 10.0, 2  # [1/s] mean over the signals, and seconds of it
-# Of slower sensors, down to `SLOWEST_HZ`: share of the samples, of which white noise reverses two thirds. Fast motion
-# does, too, by more than this product of two steps [SI²].
-SLOWEST_HZ, NOISY_SHARE, QUIET_TURN = 7.0, 0.6, 0.01
+# Of slower sensors, down to `SLOWEST_HZ`: the share of samples that reverse, two thirds in white noise. Fast motion
+# reverses as often, by larger steps: only reversals by at most this product of two steps [SI²] count.
+SLOWEST_HZ, NOISY_SHARE, SMALL_TURN = 7.0, 0.6, 0.01
 MOVING = 0.5  # [m/s²] standard deviation of an axis of accel of a sensor that moves
 ROUNDING_TURN = 1e-14  # product of two steps [SI] that are rounding
 
@@ -132,7 +132,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         gyro_S, accel_S = map(np.ascontiguousarray, values)
         if not (_may_have_faults(gyro_S) or _may_have_faults(accel_S)):
             continue
-        own, covered, moves = list[Fault](), np.zeros(len(time), dtype=bool), accel_S.std(axis=0).max() > MOVING
+        own, covered = list[Fault](), np.zeros(len(time), dtype=bool)
         before = float(np.nextafter(time[0], -np.inf))  # the first sample is faulty, too
         for signals, signal in ((GYRO, gyro_S), (ACCEL, accel_S)):
             if (dead := _find_dead_axis(time, signal, accel_S)) is not None:
@@ -158,12 +158,14 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             for a, b in zip(first[long & rare].tolist(), last[long & rare].tolist(), strict=True):
                 if covered[a : b + 1].all():
                     continue
-                is_stuck, is_zero = noisy, signals == GYRO and not gyro_S[a].any()
-                if b - a == len(time) - 1:
+                is_stuck, is_whole = noisy, b - a == len(time) - 1
+                if is_whole:
                     is_stuck = any(_is_noisy(each[0], values) for each in samples.values() for values in each[1:])
-                if is_zero:  # a firmware with a dead zone reports zero at any rest
+                if signals == GYRO and not gyro_S[a].any():  # a firmware with a dead zone reports zero at any rest
                     others = np.count_nonzero(of_gyro & ~gyro_S.any(axis=1)) - (b - a)
-                    is_stuck &= others < FROZEN_SAMPLES and (moves or any(each[1].any() for each in samples.values()))
+                    moves = accel_S[a : b + 1].std(axis=0).max() > MOVING
+                    is_known = moves or (is_whole and any(each[1].any() for each in samples.values()))
+                    is_stuck &= others < FROZEN_SAMPLES and is_known
                 if is_stuck:
                     covered[a : b + 1] = True
                     begin = float(time[a]) if a else before
@@ -217,16 +219,16 @@ def _may_have_faults(values):  # type: ignore[no-untyped-def]
 def _is_noisy(time, values):  # type: ignore[no-untyped-def]
     """Return whether signals (n, 3) reverse as in noise for `NOISY_S` seconds, without the rows that repeat."""
     older = old = 0  # the last two rows that differ
-    begin = turns = quiet = noisy_s = 0  # first row and reversals of this second
+    begin = turns = small = noisy_s = 0  # first row and reversals of this second
     for row in range(1, len(time)):
         if is_same(values[old], values[row]):
             continue
         turns += count_turns(values[older], values[old], values[row], np.inf)
-        quiet += count_turns(values[older], values[old], values[row], QUIET_TURN)
+        small += count_turns(values[older], values[old], values[row], SMALL_TURN)
         older, old = old, row
         if time[row] - time[begin] >= 1.0:
-            noisy_s += are_noise(turns / 3.0, quiet / 3.0, row - begin, time[row] - time[begin])
-            begin, turns, quiet = row, 0, 0
+            noisy_s += are_noise(turns / 3.0, small / 3.0, row - begin, time[row] - time[begin])
+            begin, turns, small = row, 0, 0
     return noisy_s >= NOISY_S
 
 
@@ -249,9 +251,9 @@ def count_turns(older, old, new, most):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def are_noise(turns, quiet, samples, seconds):  # type: ignore[no-untyped-def]
-    """Return whether so many reversals of a signal, and so many of them quiet, are those of noise."""
-    return turns > NOISY_HZ * seconds or (samples >= SLOWEST_HZ * seconds and quiet > NOISY_SHARE * samples)
+def are_noise(turns, small, samples, seconds):  # type: ignore[no-untyped-def]
+    """Return whether so many reversals of a signal, and so many of them small, are those of noise."""
+    return turns > NOISY_HZ * seconds or (samples >= SLOWEST_HZ * seconds and small > NOISY_SHARE * samples)
 
 
 # Saturation -----------------------------------------------------------------------------------------------------------
