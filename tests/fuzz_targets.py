@@ -159,11 +159,7 @@ def device(format: str) -> bytes:
     if format == "mvnx":
         return written(lambda folder: df.mvnx(folder, df.turning(), raw=True))
     data = written(lambda folder: df.make(format, folder))
-    return data if format == "xdf" else first_rows(data)
-
-
-def first_rows(data: bytes) -> bytes:
-    return b"".join(data.splitlines(keepends=True)[:50])
+    return data if format == "xdf" else b"".join(data.splitlines(keepends=True)[:50])
 
 
 def shipped(*names: str) -> list[bytes]:

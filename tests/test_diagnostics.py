@@ -33,10 +33,6 @@ def calls() -> Iterator[tuple[str, ast.Call]]:
                 yield f"{path.relative_to(PACKAGE)}:{node.lineno}", node
 
 
-def literals(node: ast.AST) -> set[str]:
-    return {n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and isinstance(n.value, str)}
-
-
 def emitted() -> set[str]:
     """Codes that the package makes: a first argument as it stands, or strings of its module where it is a name."""
     codes = set()
@@ -49,7 +45,7 @@ def emitted() -> set[str]:
             codes.add(code.value)
         else:
             source = ast.parse((PACKAGE / place.rpartition(":")[0]).read_text(encoding="utf-8"))
-            named = literals(source) & set(CATALOGUE)
+            named = {node.value for node in ast.walk(source) if isinstance(node, ast.Constant)} & set(CATALOGUE)
             assert named, f"{place}: the code is no string, and no string of the module is one"
             codes |= named
     return codes

@@ -41,11 +41,6 @@ def blocks(page: str, language: str) -> list[str]:
     return [body for kind, body in FENCE.findall(text_of(page)) if kind == language]
 
 
-def code_spans(page: str) -> list[str]:
-    """What stands in backticks outside of code blocks."""
-    return [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", FENCE.sub("", text_of(page)))]
-
-
 @cache
 def known_words() -> frozenset[str]:
     """Names that the sources define, words of their strings, and keys of the project's own TOML files."""
@@ -124,7 +119,7 @@ def missing(span: str) -> str:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_what_stands_in_backticks_exists(page: str) -> None:
-    spans = code_spans(page)
+    spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", FENCE.sub("", text_of(page)))]
     assert len(spans) > 20
     assert [span for span in map(missing, spans) if span] == []
 

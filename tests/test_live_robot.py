@@ -44,10 +44,6 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> retargeting.Robot:
     return retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
 
 
-def stream_info(pose: wp.Pose) -> StreamInfo:
-    return StreamInfo(tuple(pose.quat_WL), tuple(pose.points), 100.0)
-
-
 def live_poses(pose: wp.Pose, std: float = 0.005) -> list[LivePose]:
     """What the loop would show."""
     quat = np.stack([pose.quat_WL[name] for name in pose.quat_WL], axis=1)
@@ -331,7 +327,7 @@ def test_a_source_that_dies_stops_the_robot_until_the_person_says_so(
 
     out.open()
     wait_until(lambda: receiver.messages)
-    out.start(stream_info(pose))
+    out.start(StreamInfo(tuple(pose.quat_WL), tuple(pose.points), 100.0))
     first = receiver.messages[0]
     assert (first["state"], first["t"], first["reason"]) == ("hold", None, "waiting for a pose")
     assert first["position"] == pytest.approx(arm.rest.tolist())

@@ -42,16 +42,7 @@ def urdf(request: pytest.FixtureRequest) -> Path:
     return request.getfixturevalue("data") / "human_urdf" / GAZEBO[request.param]
 
 
-@pytest.fixture(params=["48", "66"])
-def gazebo(request: pytest.FixtureRequest, data: Path) -> Path:
-    return data / "human_urdf" / GAZEBO[request.param]
-
-
 # An independent way from one configuration to the other -----------------------------------------------------------
-
-
-def joints_above(root: ET.Element) -> dict[str, ET.Element]:
-    return {joint.find("child").get("link"): joint for joint in root.findall("joint")}
 
 
 def configurations(text: str, body: BodyModel, rng: np.random.Generator) -> tuple[pin.Model, np.ndarray, np.ndarray]:
@@ -61,7 +52,7 @@ def configurations(text: str, body: BodyModel, rng: np.random.Generator) -> tupl
     q_raw = pin.integrate(raw, pin.neutral(raw), angles)
     data = raw.createData()
     pin.forwardKinematics(raw, data, q_raw)
-    above = joints_above(ET.fromstring(text.encode()))
+    above = {joint.find("child").get("link"): joint for joint in ET.fromstring(text.encode()).findall("joint")}
     q = pin.neutral(body.pin)
     for k, name in enumerate(body.pin.names):
         first = body.pin.idx_qs[k]
@@ -207,8 +198,9 @@ def test_the_written_urdf_reads_the_same_everywhere(urdf: Path, tmp_path: Path) 
 # Models of others -------------------------------------------------------------------------------------------------
 
 
-def test_human_gazebo_stands_in_the_t_pose_at_zero(gazebo: Path) -> None:
-    body = load_model(gazebo)
+@pytest.mark.parametrize("name", ["48", "66"])
+def test_human_gazebo_stands_in_the_t_pose_at_zero(name: str, data: Path) -> None:
+    body = load_model(data / "human_urdf" / GAZEBO[name])
     at = link_placements(body.pin, pin.neutral(body.pin))
     for side, sign in (("left", 1.0), ("right", -1.0)):
         R_WL = Rotation.from_rotvec([sign * np.pi / 2.0, 0.0, 0.0]).as_matrix()  # lifted sideways, palms down

@@ -73,18 +73,6 @@ def test_elbow_and_wrist_stand_to_the_shoulder_as_in_xsens(tracked, side: str, n
         assert np.linalg.norm(ours - theirs, axis=1).max() < 1e-3  # 0.17 mm found
 
 
-def repeat_frames(path: Path, out: Path, count: int) -> None:
-    """Write a copy whose frames of motion are repeated, one after the other, to `count` at least."""
-    tree = ElementTree.parse(path)
-    frames = tree.getroot().find(".//{*}frames")
-    assert frames is not None
-    moving = [frame for frame in frames if frame.get("type") == "normal"]
-    for k in range(len(moving), count):
-        frames.append(deepcopy(moving[k % len(moving)]))
-        frames[-1].set("index", str(k))
-    tree.write(out)
-
-
 @pytest.mark.parametrize("file", ["test_mocap.mvnx", "Meri-020.mvnx"])
 @pytest.mark.parametrize(("side", "name"), [("left", "Left"), ("right", "Right")])
 def test_elbow_and_wrist_have_the_joint_angles_of_xsens(
@@ -92,7 +80,14 @@ def test_elbow_and_wrist_have_the_joint_angles_of_xsens(
 ) -> None:
     """Of MVN's three, z, x, y of a Z-X-Y sequence as the ISB has it, abduction (x) has the other sign."""
     path = tmp_path / file
-    repeat_frames(data / "mvnx" / file, path, 100)
+    tree = ElementTree.parse(data / "mvnx" / file)
+    frames = tree.getroot().find(".//{*}frames")
+    assert frames is not None
+    moving = [frame for frame in frames if frame.get("type") == "normal"]
+    for k in range(len(moving), 100):  # repeated, one after the other, to 100 at least
+        frames.append(deepcopy(moving[k % len(moving)]))
+        frames[-1].set("index", str(k))
+    tree.write(path)
     angles = wp.joint_angles(
         wp.track(
             wp.load_session(session(tmp_path, path, (*OURS, "left_hand", "right_hand"), 'use = "orientation"'))

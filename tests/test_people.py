@@ -43,12 +43,6 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def shoulder_offset(sim: Simulation, side: str) -> np.ndarray:
-    """Shoulder (n, 3) [m] in T from its place by the lengths."""
-    place = (0.0, (1.0 if side == "left" else -1.0) * sim.lengths["shoulder_width"] / 2.0, sim.lengths["trunk"])
-    return in_torso(sim, sim.points[f"{side}_shoulder"]) - place
-
-
 # Elbow, wrists, start pose ---------------------------------------------------------------------------------------
 
 
@@ -116,8 +110,8 @@ def test_arms_do_tasks_as_people_do() -> None:
         upper_W = Rotation.from_quat(sim.quat_WL[f"{side}_upper_arm"][doing]).apply((0.0, 0.0, -1.0))
         elevation = np.rad2deg(np.arccos(-upper_W[:, 2]))
         assert 0.01 < np.mean(elevation > 60.0) < 0.15
-        offset = shoulder_offset(sim, side)
-        assert 0.008 < np.sqrt(3.0) * rms(offset[doing] - offset[100]) < 0.035
+        shoulder = in_torso(sim, sim.points[f"{side}_shoulder"])
+        assert 0.008 < np.sqrt(3.0) * rms(shoulder[doing] - shoulder[100]) < 0.035
     # no instant at which all sensors rest for long: nobody stands as on a table
     moving = np.max([np.linalg.norm(sim.gyro_S[segment], axis=1) for segment in SEGMENTS], axis=0)[doing]
     assert np.mean(moving < np.deg2rad(0.3)) < 0.1

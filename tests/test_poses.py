@@ -39,16 +39,6 @@ def solve(person: Person, recording: Recording, protocol: str) -> Calibration:
     )
 
 
-def as_trackers(recording: Recording) -> Recording:
-    """The orientations by sensors that give no accelerations, mounts unknown."""
-    rest, rate, sensors = recording.phases["start"][0], recording.rate_hz, {}
-    for name, sensor in recording.imus.items():
-        sensors[name] = OrientationSensor(
-            estimate_orientation(sensor.gyro_S, sensor.accel_S, rate, static=rest).quat_VS
-        )
-    return replace(recording, sensors=sensors, remounted=True)
-
-
 def torso_heading_std(calibration: Calibration) -> float:
     return float(np.degrees(calibration.subject.std("mounts.torso.z")))
 
@@ -60,7 +50,12 @@ def headings_by_std(calibration: Calibration, simulation: Simulation) -> np.ndar
 
 def test_a_bow_shows_where_the_torso_faces_to_sensors_without_accelerations() -> None:
     person, simulation = perform("clasp+bow")
-    recording = as_trackers(simulation.recording())
+    recording, sensors = simulation.recording(), {}
+    rest, rate = recording.phases["start"][0], recording.rate_hz
+    for name, sensor in recording.imus.items():
+        orientation = estimate_orientation(sensor.gyro_S, sensor.accel_S, rate, static=rest)
+        sensors[name] = OrientationSensor(orientation.quat_VS)
+    recording = replace(recording, sensors=sensors, remounted=True)
     hands, bowed = (solve(person, recording, protocol) for protocol in ("clasp", "clasp+bow"))
     assert torso_heading_std(bowed) < 0.75 * torso_heading_std(hands)
     for calibration in (hands, bowed):

@@ -40,20 +40,15 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
-def put_earlier_result(out: Path, name: str) -> None:
-    """A result on another body, which has joints of one axis."""
-    body = load_model("whole_body")
-    write_subject(out, population_subject(body=body), body)
-    (out / name).write_text('{"joints": {"elbow": {}}}', encoding="utf-8")
-    pl.DataFrame({"time": [0.0], "elbow": [0.1]}).write_parquet(out / "joints.parquet")
-
-
 @WRITERS
 def test_the_body_of_an_earlier_result_does_not_stay(
     write: Callable[[Path, Path], None], session: Path, tmp_path: Path
 ) -> None:
     """It would be read with the new subject."""
-    put_earlier_result(tmp_path, "summary.json")
+    body = load_model("whole_body")  # another one, which has joints of one axis
+    write_subject(tmp_path, population_subject(body=body), body)
+    (tmp_path / "summary.json").write_text('{"joints": {"elbow": {}}}', encoding="utf-8")
+    pl.DataFrame({"time": [0.0], "elbow": [0.1]}).write_parquet(tmp_path / "joints.parquet")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     assert "left_thigh" in load_model(tmp_path / "subject.urdf").table.segments
     write(session, tmp_path)

@@ -13,7 +13,6 @@ from arms import HAND, JOINTS, UPPER, is_sound, person, write_arm
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import errors, retargeting
-from wepose_pin.body.kinematics import Pose
 from wepose_pin.retargeting import controller as control
 from wepose_pin.retargeting.collision import CollisionModel
 
@@ -158,17 +157,14 @@ def test_the_programme_is_that_of_pink(arm) -> None:
     assert np.abs(ours - theirs).max() < 0.03 * np.abs(ours).max()
 
 
-def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:
-    """The arm stretched out `by` times its length, forward and up, over a span."""
-    inside = (pose.time >= span[0]) & (pose.time < span[1])
-    points = dict(pose.points)
-    hand = points["right_palm"].copy()
-    hand[inside] = points["right_shoulder"][inside] + by * (UPPER + 0.27 + HAND) * np.array([0.8, -0.3, 0.2])
-    return replace(pose, points=points | {"right_palm": hand})
-
-
 def test_five_seconds_out_of_reach(arm, swung: retargeting.Trajectory) -> None:
-    pose = far_away(person(11.0, swing=0.0), (3.0, 8.0), 1.6)
+    """The arm is stretched out 1.6 times its length, forward and up."""
+    pose = person(11.0, swing=0.0)
+    inside = (pose.time >= 3.0) & (pose.time < 8.0)
+    hand = pose.points["right_palm"].copy()
+    away = 1.6 * (UPPER + 0.27 + HAND) * np.array([0.8, -0.3, 0.2])
+    hand[inside] = pose.points["right_shoulder"][inside] + away
+    pose = replace(pose, points=pose.points | {"right_palm": hand})
     trajectory = retargeting.retarget(pose, arm, scale=swung.scale["right"])
     is_sound(trajectory)
     target = trajectory.targets[0]

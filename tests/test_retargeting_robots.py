@@ -20,15 +20,12 @@ pytestmark = [
 ]
 
 
-def both_arms(seconds: float, **angles: float) -> Pose:
-    right, left = person(seconds, **angles), person(seconds, side="left", **({"swing": 15.0} | angles))
-    return replace(right, quat_WL=right.quat_WL | left.quat_WL, points=right.points | left.points)
-
-
 @pytest.mark.parametrize("name", retargeting.ROBOTS)
 def test_every_robot_follows_and_keeps_its_limits(name: str) -> None:
     robot = retargeting.load_robot(retargeting.find_map(name))
-    trajectory = retargeting.retarget(both_arms(4.0), robot)
+    right, left = person(4.0), person(4.0, side="left", swing=15.0)
+    both = replace(right, quat_WL=right.quat_WL | left.quat_WL, points=right.points | left.points)
+    trajectory = retargeting.retarget(both, robot)
     is_sound(trajectory)
     for arm, target in zip(robot.arms, trajectory.targets, strict=True):
         error = np.linalg.norm(trajectory.hand[arm.side] - target.position, axis=1)[trajectory.approach_samples :]

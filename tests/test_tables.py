@@ -45,7 +45,6 @@ TABLES: list[tuple[str, tuple[str, str], tuple[str, ...]]] = [
         ("lengths.forearm", "wrist_3_link", "name the segment between them"),
     ),
     ("", ('to = "elbow"', 'to = "base"'), ("lengths.upper_arm", "different places")),
-    ("", ('elbow = "forearm_link"', 'elbow = "upper_arm_link"'), ("lengths.upper_arm", "different places")),
     (AGAIN, ("", ""), ("lengths.upper_arm, lengths.again", "upper_arm_link", "different directions")),
     ("", ('to = "elbow"', 'to = "elbov"'), ("lengths.upper_arm", "elbov", "did you mean 'elbow'")),
     (HINGE, ('moves = "forearm_link"', 'moves = "upper_arm_link"'), ("hinges.bend", "two segments")),
