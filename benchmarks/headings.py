@@ -59,6 +59,7 @@ class FreeMotion(Motion):
 
     def prepare(self, rng: np.random.Generator) -> None:
         self.hand = {side: [Wander(rng) for _ in MIDDLE] for side in SIDES}
+        super().prepare(rng)
         self.phases.pop(self.name)
 
     def _palms(self, t: np.ndarray, motion_share: np.ndarray, _clasp_T: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,6 +9,8 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.bodies import XSENS_JOINTS, measure_mvnx, measure_ring_links, measure_ring_orientations
+from benchmarks.headings import ClaspedFreeMotion, simulate_free_motion
+from wepose_pin import IDEAL_PRESET, simulate_person
 
 MOUNTS = ["rigid", pytest.param("loose", marks=pytest.mark.slow)]
 # [mm] mean and largest distance of a point, a tenth above what was found. All of it is where the shoulders are from the
@@ -38,6 +40,14 @@ def test_what_cannot_be_measured_is_one_line(
     with pytest.raises(SystemExit) as stop:
         run("thoughts")
     assert stop.value.code == 2
+
+
+def test_hands_that_move_at_random_clasp_at_times() -> None:
+    simulation = simulate_free_motion(ClaspedFreeMotion, simulate_person(1), 1, IDEAL_PRESET, 330.0)
+    [(begin, end)] = simulation.phases["clasp"]
+    joined = (simulation.time > begin) & (simulation.time < end)
+    gap = simulation.points["left_palm"] - simulation.points["right_palm"]
+    assert np.linalg.norm(gap[joined], axis=1).max() < 0.01 < np.linalg.norm(gap, axis=1).max()
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
