@@ -125,8 +125,10 @@ def ximu3(folder: Path, first_us: int = 52100347) -> Path:
 
 def sto(path: Path, labels: tuple[str, ...] = ("torso_imu", "humerus_r_imu")) -> Path:
     head = "DataRate=100.000000\nDataType=Quaternion\nversion=3\nOpenSimVersion=4.4\nendheader\n"
-    cells = [",".join(f"{value:.9f}" for value in quat) for quat in WXYZ]
-    columns = [[f"{t:.6f}" for t in TIME], *[cells] * len(labels)]
+    columns = [[f"{t:.6f}" for t in TIME]]
+    for k in range(len(labels)):  # no sensor is a copy of another
+        quats = (Rotation.from_rotvec([0.0, 0.0, 2e-7 * k]) * R_WS).as_quat()[:, [3, 0, 1, 2]]
+        columns.append([",".join(f"{value:.9f}" for value in quat) for quat in quats])
     path.write_text(head + table_text(columns, ["time", *labels], "\t"))
     return path
 
