@@ -16,7 +16,7 @@ from functools import lru_cache
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 
 class Severity(StrEnum):
@@ -162,18 +162,17 @@ def quantity(value: float | None, unit: str) -> str:
     return (text.rstrip("0").rstrip(".") if "." in text else text) + name
 
 
-class _Fact(NamedTuple):
-    """A fact in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
+def _fill(template: str, known: Mapping[str, Any]) -> str:
+    """Fill in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
 
-    value: Any
-
-    def __format__(self, unit: str) -> str:
-        text = quantity(self.value, unit) if unit and unit != "name" else str(self.value)
+    def write(match: re.Match[str]) -> str:
+        if match[1] is None:
+            return match[0][0]  # a doubled brace
+        value, unit = known[match[1]], match[2]
+        text = quantity(value, unit) if unit and unit != "name" else str(value)
         return text.replace("_", " ") if unit == "name" else text
 
-
-def _fill(template: str, known: Mapping[str, Any]) -> str:
-    text = template.format_map({name: _Fact(value) for name, value in known.items()})
+    text = re.sub(r"\{\{|\}\}|\{(\w+)(?::([^}]+))?\}", write, template)
     # A name at the beginning of a sentence; a file's name stays as it is.
     return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
 
