@@ -159,7 +159,7 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY") -> Angles:
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
     Angles are continuous over time; samples within 10° of gimbal lock are flagged, and full turns are not added up
-    there. Standard deviations are to first order, with the errors of two segments independent but for their headings.
+    there. Standard deviations are to first order; errors of two segments are independent except those of headings.
 
     Parameters
     ----------
@@ -244,7 +244,9 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
-        cov_W[:, 2, 2] -= 2.0 * pose.find_heading_cov(*members)[known]  # what both have in common turns no joint
+        cov_W[:, 2, 2] -= (
+            2.0 * pose.find_heading_cov(*members)[known]
+        )  # a common heading error does not rotate the joint
         rows = _gradients(values, joint.sequence, quat_WP, left)
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = _expand(known, np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN))

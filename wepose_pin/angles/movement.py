@@ -179,7 +179,9 @@ def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np
     """Standard deviations (m,) [rad] of the k-th angle at the second sample of each pair (m, 2) less the first."""
     rows = compute_gradients(pose, name, joint, pairs.ravel())[:, k].reshape(-1, 2, 1, 3)
     variances = np.zeros((2, len(pairs)))  # constant in W, in L
-    shared = pose.find_heading_cov(JOINTS[name].proximal, JOINTS[name].distal)[pairs]  # turns no joint
+    shared = pose.find_heading_cov(JOINTS[name].proximal, JOINTS[name].distal)[
+        pairs
+    ]  # a common error does not rotate the joint
     for segment in (JOINTS[name].proximal, JOINTS[name].distal):
         if segment == "world" or not len(pairs):
             continue

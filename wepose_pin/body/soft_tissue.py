@@ -59,8 +59,8 @@ def estimate_pose_share(offsets: Mapping[str, np.ndarray], table: BodyTable) -> 
 def estimate_repeat_share(tilts: Collection[float]) -> float:
     """Estimate how much a start pose differs from that of the calibration, as a share of what the table states.
 
-    It follows by empirical Bayes from the `tilts` between both, each over its standard deviation: who repeats them
-    exactly, as in the calibration's own recording, repeats the headings too, which nothing shows.
+    It is an empirical Bayes estimate from the `tilts` between both, each over its standard deviation. The headings
+    cannot be observed: they are assumed to repeat as exactly as the tilts do, as in the calibration's own recording.
     """
     if not tilts:
         return 1.0

@@ -48,7 +48,7 @@ class Hinge(NamedTuple):
     # (3,) unit, in the frame of the segment above
     axis: Annotated[np.ndarray, replace(_UNIT, each=("x", "y", "z"))]
     # [rad] by which the segment below leaves the plane across it, with soft tissue
-    std: Annotated[NonNegative, Key(unit="deg", least=1e-3, most=57.3, digits=3)]
+    std: Annotated[NonNegative, Key(unit="deg", least=0.0, most=57.3, digits=3)]
     # [rad/rad] by which the sensor above lags behind the twist that it shows; None: not known
     twist_lag: Annotated[float | None, Key(least=-10.0, most=10.0, digits=4)] = None
 

@@ -191,9 +191,9 @@ class HeadingFilter:
                     for share in (repeat_share, 1.0)
                 )
         # (k, k) [rad²]; a calibration knows the headings of mounts against each other better than that of each.
-        rows = [f"mounts.{name}.z" for name in self.names]
-        known_rows = [] if first.remounted else rows
-        self.mount_cov = subject.lengths_covariance(known_rows or rows) * bool(known_rows) + LEAST_MOUNT_VAR * np.eye(k)
+        self.mount_cov = LEAST_MOUNT_VAR * np.eye(k)
+        if not first.remounted:
+            self.mount_cov += subject.lengths_covariance([f"mounts.{name}.z" for name in self.names])
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
         h, always, known = len(self.hinges), np.inf, np.sqrt(start[3])
         rate_std = np.hypot(RATE_STD[kind], np.where(np.isfinite(known), known, rate_std))
@@ -262,8 +262,7 @@ class HeadingFilter:
         self.x[heading], self.x[start] = headings, 0.0
         for columns in (heading, mount, start):
             P[columns, :], P[:, columns] = 0.0, 0.0
-        columns = np.concatenate([heading, mount, start])
-        none = np.zeros(mount_cov.shape)
+        columns, none = np.concatenate([heading, mount, start]), np.zeros(mount_cov.shape)
         P[np.ix_(columns, columns)] = np.block(
             [
                 [start_cov + mount_cov, -mount_cov, start_cov],
