@@ -25,7 +25,6 @@ IDENTIFIER = re.compile(rf"(left|right)_({'|'.join(PARTS)})|\b({'|'.join(name fo
 # Files and folders that may name them, and why.
 ALLOWED = {
     "angles/joints.py": "definitions of joint angles",
-    "live/sources/slimevr.py": "the numbers of a format",
     "report/words.py": "a plural of English",
     "readers/mvnx.py": "the names of a format",
     "writers/motion_capture.py": "the names of a format",

@@ -1,19 +1,25 @@
-"""Sources of orientations over the network, against senders written from the formats' descriptions, byte by byte."""
+"""The plug-in examples/slimevr, against a sender written from the protocol's description, byte by byte."""
 
 from __future__ import annotations
 
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from sampling import find_free_port
 from scipy.spatial.transform import Rotation
 
-from wepose_pin import BadSource
-from wepose_pin.live.sources import Source, open_source
+from wepose_pin import BadOption, BadSource
+from wepose_pin.body import load_table
+from wepose_pin.live.sources import Source, SourceOptions
+
+sys.path.append(str(Path(__file__).parents[1] / "examples" / "slimevr"))
+import wepose_slimevr as slimevr
 
 # Packets as a tracker sends them; rotation and acceleration are the worked example of the protocol's description.
 MAC = bytes.fromhex("4c11ae0000a1")
@@ -25,12 +31,17 @@ ROTATION = bytes.fromhex("00000011 000000000000002a 01 01 00000000 00000000 0000
 ACCELERATION = bytes.fromhex("00000004 000000000000002b 00000000 00000000 3f800000 01")
 
 
+def open_slimevr(rest: str, sensors: tuple[str, ...] | None = None) -> Source:
+    segments = sensors or tuple(load_table().segments)
+    return slimevr.SOURCE.open_spec(rest, SourceOptions(f"slimevr:{rest}", sensors, segments))
+
+
 class Tracker:
     """Sends packets to a source that it connects to."""
 
-    def __init__(self, **options: object) -> None:
+    def __init__(self, sensors: tuple[str, ...] | None = None) -> None:
         self.port = find_free_port()
-        self.source: Source = open_source(f"slimevr:{self.port}", **options)  # type: ignore[arg-type]
+        self.source = open_slimevr(str(self.port), sensors)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(60.0)
@@ -99,7 +110,7 @@ def test_trackers_without_a_place_are_named_and_can_be_assigned(tracker: Tracker
     assert where in tracker.source.problems
     assert f"1 {where}" in tracker.source.describe_awaited()
     name = "4c:11:ae:00:00:a1/1"  # of an earlier guide
-    named = Tracker(sensors=[name], segments=[name])
+    named = Tracker((name,))
     named.send(HANDSHAKE, ROTATION, ROTATION.replace(b"\x2a", b"\x2b")[:20])
     np.testing.assert_allclose(named.read(1)[name], [[0.0, 0.0, 0.0, 1.0]], atol=1e-7)
     assert not named.read(1, 0.2)
@@ -109,4 +120,6 @@ def test_trackers_without_a_place_are_named_and_can_be_assigned(tracker: Tracker
 
 def test_an_address_that_is_not_ours_is_said() -> None:
     with pytest.raises(BadSource, match=r"slimevr:192\.0\.2\.1:6969: cannot listen there"):
-        open_source("slimevr:192.0.2.1:6969").open()
+        open_slimevr("192.0.2.1").open()
+    with pytest.raises(BadOption, match="70000: a port or HOST:PORT"):
+        open_slimevr("0.0.0.0:70000")

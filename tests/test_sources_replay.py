@@ -98,7 +98,8 @@ def test_measured_orientations_come_as_six_numbers() -> None:
         ("udp:9000", {"sensors": ["trunk"]}, "'trunk' is not a segment"),
         ("udp:9000,gyro_unit=rpm", {}, "gyro_unit 'rpm' is not known; there is: rad/s, deg/s"),
         ("udp:9000,unit=g", {}, "'unit=g' is no unit"),
-        ("slimevr:0.0.0.0:70000", {}, "70000: a port or HOST:PORT"),
+        ("udp:0.0.0.0:70000", {}, "70000: a port or HOST:PORT"),
+        ("lsl:", {}, "source 'lsl:' is not known"),
     ],
 )
 def test_a_wrong_spec_says_what_is_right(spec: str, options: dict, words: str) -> None:

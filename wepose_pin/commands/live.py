@@ -64,8 +64,8 @@ def live(
     Parameters
     ----------
     source
-        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, slimevr:[HOST] or a plug-in
-        (docs/live-sources.md). Without HOST only this machine can send.
+        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME or a plug-in (docs/live-sources.md). Without HOST
+        only this machine can send.
     subject
         SUBJECT is a subject.toml or its folder, as `wepose calibrate` writes it.
     session

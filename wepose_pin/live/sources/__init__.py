@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from ...libraries import find_plugins, load_plugin
 from ...recording.arrivals import Samples
 from ...recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 
+PLUGINS = ("mti", "slimevr")  # in examples/
 MAX_PROBLEMS = 24  # kinds
 MAX_TIME = 1e10  # [s] seconds since 1970 have ten digits; larger times are in another unit, or damaged
 MAX_VALUES = np.repeat([HIGHEST_RATE, HIGHEST_ACCEL], 3)
@@ -141,9 +143,12 @@ def open_source(
     name, colon, rest = spec.partition(":")
     names = find_plugins("sources")
     kind: SourceKind | None = load_plugin("sources", name) if name in names and colon else None
-    if kind is None or not (rest or name == "slimevr"):
-        forms = [load_plugin("sources", each).form for each in names]
-        plugin = "; mti is a plug-in: pip install examples/mti" if name == "mti" and name not in names else ""
+    if kind is None or not rest:
+        forms = []
+        for each in names:
+            with suppress(BadOption):  # a plug-in that cannot be imported
+                forms.append(load_plugin("sources", each).form)
+        plugin = f"; {name} is a plug-in: pip install examples/{name}" if name in PLUGINS and name not in names else ""
         raise BadOption(f"source '{spec}' is not known; {one_of(forms, name)}{plugin}")
     known = tuple(load_table().segments if segments is None else segments)
     options = SourceOptions(spec, None if sensors is None else tuple(sensors), known, any_name, speed)

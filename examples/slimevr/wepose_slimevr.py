@@ -1,9 +1,9 @@
-"""SlimeVR trackers over Wi-Fi, for which this is the server they look for.
+"""SlimeVR trackers over Wi-Fi as a source of `wepose live`, the server they look for: `pip install examples/slimevr`.
 
 A tracker broadcasts a handshake until a server answers, then sends its orientation, to a world with z up whose heading
 is its own, and the places of its sensors on the body. It wants a heartbeat at least every three seconds, and sends no
-rates. Big-endian; a packet is its type (u32), a rising number (u64; 0 is always taken) and data. Source:
-SlimeVR-Tracker-ESP, protocol version 22.
+rates. Big-endian; a packet is its type (u32), a rising number (u64; 0 is always taken) and data. It was tested against
+an emulator, not with a device. Source: SlimeVR-Tracker-ESP, protocol version 22.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from ...recording.arrivals import Samples, pack_orientations
-from . import SourceKind, SourceOptions
-from .udp import LOOPBACK, DatagramSource, parse_address
+from wepose_pin.live.sources import SourceKind, SourceOptions
+from wepose_pin.live.sources.udp import DatagramSource, parse_address
+from wepose_pin.recording.arrivals import Samples, pack_orientations
 
 PORT = 6969
 HEARTBEAT_S = 0.5  # [s] from one to the next
@@ -46,8 +46,8 @@ class Tracker:
 
 
 def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
-    """The source of ``slimevr:[HOST][:PORT]``."""
-    host, port = rest or LOOPBACK, PORT
+    """The source of ``slimevr:HOST[:PORT]``, or of a port of this machine alone."""
+    host, port = rest, PORT
     if rest.isdigit() or ":" in rest:
         host, port = parse_address(rest, f"source '{options.spec}':", PORT)
     return SlimeVrSource(host, port, options.sensors, None if options.any_name else options.segments)
@@ -141,4 +141,4 @@ class SlimeVrSource(DatagramSource):
         return tracker.places.get(sensor) or (named if self.segments is None and tracker.mac else None)
 
 
-KIND = SourceKind("slimevr:[HOST][:PORT]", open_spec)
+SOURCE = SourceKind("slimevr:HOST[:PORT]", open_spec)
