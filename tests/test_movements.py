@@ -166,9 +166,8 @@ def test_where_nothing_repeats_there_are_phases_all_the_same(
     ("words", "said"),
     [
         ("--low-pass-hz 60", "--low-pass-hz 60: above 0 and below 45 Hz"),
-        ("--main-angle elbow", "--main-angle elbow: no such angle in the result"),
-        ("--repetitions bent", "--repetitions bent: the recording has no such phase; did you mean 'bend'"),
-        ("--repetitions bend --main-angle right_elbow_flexion", "and --repetitions bend marks them"),
+        ("--repetitions bent", "no such phase of the recording, and no such angle; did you mean 'bend'"),
+        ("--repetitions right_elbow_flex", "and no such angle; did you mean 'right_elbow_flexion'"),
         ("--interval 5 99", "--interval 5 99: the recording runs from 0 to 14 s"),
         ("--phase bend", "--phase bend: bend has 3 intervals"),
         ("--shoulder XYZ", 'Invalid value "XYZ" for --shoulder'),

@@ -279,7 +279,6 @@ def test_wepose_evaluate_says_what_was_fitted(
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--no-align", "--fit", "world"), "nothing is fitted with --no-align"),
         (("--fit", "world", "--interval", "1", "5"), "seconds after"),
         (("--markers", "m.toml"), "has no markers"),
     ],

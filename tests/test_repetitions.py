@@ -155,11 +155,6 @@ def test_a_repetition_in_a_gap_is_left_out() -> None:
     assert repetitions.left_out == 1
 
 
-def test_an_angle_that_is_not_there_is_named() -> None:
-    with pytest.raises(wp.WeposeError, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
-        find(reach(2.0), main_angle="right_elbow_flex")
-
-
 def test_the_cmc_is_kadabas() -> None:
     rng = np.random.default_rng(3)
     curves = np.sin(np.linspace(0.0, 6.0, 50)) + rng.normal(0.0, 0.3, (7, 50))

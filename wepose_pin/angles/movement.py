@@ -20,7 +20,7 @@ from ..recording import Intervals, find_runs
 from ..rotations import unwrap_signs
 from .euler import count_turns
 from .joints import AUTO, JOINTS, Angles, JointAngles, compute_gradients, joint_angles
-from .repetitions import PERCENT, MeanCurve, Repetitions, compute_mean_curves, find_repetitions
+from .repetitions import PERCENT, MeanCurve, Repetitions, compute_mean_curves, find_repetitions, list_angles
 
 # Rates are means over this time [s], to the nearest whole number of samples: noise of the orientation is divided by it,
 # and a sine of 2 Hz reads 1.6% low, one of 5 Hz 10%.
@@ -54,16 +54,15 @@ def analyze_movement(
     *,
     sequence: str = AUTO,
     cutoff_hz: float | None = None,
-    phase: str | None = None,
-    main_angle: str | None = None,
+    repetitions: str | None = None,
     rising: bool | None = None,
 ) -> Movement:
     """Compute the angles of a session, find its repetitions and measure them.
 
     The shoulder's angles are of `sequence`, as in `joint_angles`, and low-passed at `cutoff_hz` (`smooth_pose`; None:
-    not). Each interval of `phase` is a repetition; None: they are found by `main_angle` and `rising`, as in
-    `find_repetitions`. `WeposeError`: no joint has both of its segments; there is no such angle or phase; a cut-off
-    that is not possible.
+    not). `repetitions` names a phase, each interval of which is one, or the angle by which they are found; None, and
+    `rising`: as in `find_repetitions`. `WeposeError`: no joint has both of its segments; there is no such angle or
+    phase; a cut-off that is not possible.
     """
     if cutoff_hz is not None:
         pose = smooth_pose(pose, cutoff_hz)
@@ -71,16 +70,17 @@ def analyze_movement(
     step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 0.0
     begin, end = pose.time[0] - step, pose.time[-1] + step
     inside = {each: tuple((a, b) for a, b in spans if a > begin and b < end) for each, spans in phases.items()}
-    if phase is None:
-        repetitions = find_repetitions(angles, main_angle, rising)
-    elif phases.get(phase):
-        reason = "" if inside[phase] else f"no interval of the phase {phase} lies in the selected time"
-        repetitions = Repetitions(np.array(inside[phase], dtype=float).reshape(-1, 2), phase, reason=reason)
+    if repetitions is not None and phases.get(repetitions):
+        marked = inside[repetitions]
+        reason = "" if marked else f"no interval of the phase {repetitions} lies in the selected time"
+        found = Repetitions(np.array(marked, dtype=float).reshape(-1, 2), repetitions, reason=reason)
+    elif repetitions in (None, *(places := list_angles(angles))):
+        found = find_repetitions(angles, repetitions, rising)
     else:
-        choices = one_of(phases, phase) if phases else "it has no phases; without --repetitions they are found"
-        raise WrongOption("repetitions", phase, f"the recording has no such phase; {choices}")
-    curves = compute_mean_curves(angles, repetitions.spans) if len(repetitions.spans) else {}
-    return Movement(name, pose, angles, inside, repetitions, curves, cutoff_hz)
+        choices = one_of((*phases, *places), repetitions, 30)
+        raise WrongOption("repetitions", repetitions, f"no such phase of the recording, and no such angle; {choices}")
+    curves = compute_mean_curves(angles, found.spans) if len(found.spans) else {}
+    return Movement(name, pose, angles, inside, found, curves, cutoff_hz)
 
 
 def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:

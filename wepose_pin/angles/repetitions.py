@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
 from .euler import count_turns
 from .joints import JOINTS, MAX_NEAR_LOCK, Angles
@@ -79,12 +78,10 @@ def find_repetitions(angles: Angles, main_angle: str | None = None, rising: bool
 
     Parameters
     ----------
-    main_angle : as ``right_elbow_flexion``; None: that of `find_main_angle`; `WrongOption`: there is no such angle
+    main_angle : of `list_angles`, as ``right_elbow_flexion``; None: that of `find_main_angle`
     rising : the angle grows first in a repetition; None: by where it rests
     """
     places = list_angles(angles)
-    if main_angle is not None and main_angle not in places:
-        raise WrongOption("main-angle", main_angle, f"no such angle in the result; {one_of(places, main_angle, 30)}")
     source = main_angle or find_main_angle(angles)
     if source is None:
         limits = f"{100 * MAX_NEAR_LOCK:g} % of the time, or in gaps for over {100 * MAX_GAP:g} %"

@@ -79,8 +79,7 @@ def evaluate(
     *,
     interval: opt.Interval | None = None,
     phase: opt.PhaseName | None = None,
-    align: Annotated[bool, opt.MORE] = True,
-    fit: Annotated[Literal["world", "segments"] | None, opt.MORE] = None,
+    fit: Annotated[Literal["none", "world", "segments"] | None, opt.MORE] = None,
     time_offset: Annotated[opt.Seconds | None, opt.MORE] = None,
     markers: Annotated[opt.File | None, opt.MORE] = None,
 ) -> Any:  # an Evaluation, whose room loads late
@@ -103,11 +102,10 @@ def evaluate(
     truth
         Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth); markers or
         rotations (.c3d), markers (.trc), an Xsens MVNX.
-    align
-        Align a file of another system with the clock and the world of the result.
     fit
-        Fit this to the result, also of a table. world: clock, heading and place; segments: in addition a constant
-        rotation of each segment's frame, for frames that are not those of docs/concepts.md.
+        Fit this to the result. world: clock, heading and place; segments: in addition a constant rotation of each
+        segment's frame, for frames that are not those of docs/concepts.md. Without it world for a file of another
+        system (segments for rotations), none for a table.
     time_offset
         Add this to the times of the reference, instead of fitting the offset.
     markers
@@ -122,8 +120,6 @@ def evaluate(
     from ..recording import select_interval
     from ..writers import load_result
 
-    if not align and fit is not None:
-        raise WrongOption("fit", fit, "nothing is fitted with --no-align; leave out one of the two")
     with progress_bar() as progress:
         progress("comparing", 0.0)
         tracked = load_result(result)
@@ -145,13 +141,13 @@ def evaluate(
             raise BadOption(f"{file}: no reference by its suffix; {one_of((*SUFFIXES, *FORMATS))}")
         else:
             reference = parse_pose_table(read_table(file), str(file))
-        if align and fit is not None:
+        if fit not in (None, "none"):
             reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=time_offset)
             first, last = registration.scored
             begin, end = selected or registration.scored
             scored = max(first, begin), min(last, end)
             if not scored[0] < scored[1]:
-                needed = f"seconds after {first:.1f}, as those before align the reference; or --no-align"
+                needed = f"seconds after {first:.1f}, as those before align the reference; or --fit none"
                 raise WrongOption("interval", f"{begin:g} {end:g}", needed)
             errors = compare(pose, reference, scored, table)
             errors = replace(errors, registration=replace(registration, scored=scored))
@@ -223,8 +219,7 @@ def angles(
     phase: opt.PhaseName | None = None,
     low_pass_hz: opt.Hz | None = None,
     force: opt.Force = False,
-    repetitions: Annotated[opt.PhaseName | None, opt.MORE] = None,
-    main_angle: Annotated[opt.Angle | None, opt.MORE] = None,
+    repetitions: Annotated[opt.Repetitions | None, opt.MORE] = None,
     shoulder: Annotated[Literal["auto", "YXY", "XZY", "ZXY"], opt.MORE] = "auto",
 ) -> None:
     """Write the joint angles of results as tables and figures for a paper.
@@ -247,9 +242,8 @@ def angles(
     low_pass_hz
         Low-pass the orientations at this frequency (half the amplitude there). Without it they are not filtered.
     repetitions
-        Take each interval of this phase as a repetition. Without it they are found in the motion.
-    main_angle
-        Find repetitions by this angle, such as right_elbow_flexion. Without it, by the angle of the largest range.
+        Take each interval of this phase as a repetition, or find them by this angle, such as right_elbow_flexion.
+        Without it, they are found by the angle of the largest range.
     shoulder
         Use this sequence for the shoulder: YXY (plane of elevation, elevation, internal rotation), XZY or ZXY (flexion
         and adduction: no gimbal lock where the arm hangs). auto: YXY, or if it is near gimbal lock in the first result
@@ -266,12 +260,9 @@ def angles(
     from ..writers import load_result, select_pose
     from ..writers.result import collect_provenance, write_provenance
 
-    if main_angle is not None and repetitions is not None:
-        raise BadOption(f"--main-angle {main_angle} finds repetitions, and --repetitions {repetitions} marks them")
     with progress_bar() as progress, whole_folder(out, force, ("angles.html",)) as folder:
         # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
-        chosen: dict[str, Any] = {"sequence": shoulder, "cutoff_hz": low_pass_hz, "phase": repetitions}
-        chosen["main_angle"] = main_angle
+        chosen: dict[str, Any] = {"sequence": shoulder, "cutoff_hz": low_pass_hz, "repetitions": repetitions}
         movements: list[Movement] = []
         for k, each in enumerate((result, *further), 1):
             progress("reading", 0.7 * (k - 1) / (1 + len(further)))
@@ -284,8 +275,8 @@ def angles(
                 raise BadOption(f"{each}: {error}" if further else str(error)) from None
             movements.append(movement)
             chosen["sequence"] = movement.sequence or chosen["sequence"]
-            if repetitions is None and len(movement.repetitions.spans):
-                chosen |= {"main_angle": movement.repetitions.source, "rising": movement.repetitions.rising}
+            if len(movement.repetitions.spans):
+                chosen |= {"repetitions": movement.repetitions.source, "rising": movement.repetitions.rising}
         progress("writing", 0.7)
         tables = build.build_tables(movements)
         for name, table in tables.items():

@@ -62,13 +62,13 @@ def register(
     if not segments:
         raise BadData(
             "pose and reference have no segment in common, whose orientation is needed to align them; give markers a "
-            "[segments] table (--markers), or take --no-align where the reference is on our clock and in our world"
+            "[segments] table (--markers), or take --fit none where the reference is on our clock and in our world"
         )
     pose = replace(pose, quat_WL={segment: pose.quat_WL[segment] for segment in segments})
     common = replace(truth, quat_WL={segment: truth.quat_WL[segment] for segment in segments})
     begin, end = float(pose.time[0]), float(pose.time[-1])
     fit_end, correlation = begin + FITTED * (end - begin), float("nan")
-    needed = f"a third of them aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
+    needed = f"a third of them aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --fit none"
     if fit_end - begin < SHORTEST_S:
         raise BadData(f"the pose lasts {end - begin:.1f} s; {needed}")
     if offset_s is None:
