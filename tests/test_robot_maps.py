@@ -53,11 +53,12 @@ def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, 
         ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
         ("elbow = -1.2", "elbo = -1.2", "rest: no moving joint 'elbo' in arm.urdf; did you mean 'elbow'"),
         ("offset = [0.0, 0.0, -0.1]", "offset = [0.0, 0.0]", r"hand.offset = \[0.0, 0.0\]; a list of 3 numbers \[m\]"),
+        ("yaw = 12.0", "yaw = 1e300", r"limits.acceleration.yaw = 1e\+300; a number from"),
         ("yaw = 12.0", "yaw = 12.0\n[limits.jerk]\nyaw = -5.0", "limits.jerk: joint 'yaw' is -5"),
         (
             "[limits.acceleration]",
             "[limits]\njerk = 'high'\n[limits.acceleration]",
-            "limits.jerk = 'high'; a finite number, or a mapping",
+            r"limits.jerk = 'high'; a number from -1e\+06 to 1e\+06, or a mapping",
         ),
         ("[rest]", "[limits.velocity]\njaw = 1.0\n[rest]", "limits.velocity: no moving joint 'jaw' in arm.urdf"),
         (

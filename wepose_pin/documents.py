@@ -329,7 +329,8 @@ def _move_files(targets: Mapping[Path, Path], partial: Path, out: Path, earlier:
         partial.rename(out)
         return
     for path in {path for pattern in earlier for path in out.glob(pattern)} - {*targets.values()}:
-        path.unlink()
+        if not path.is_dir():
+            path.unlink()
     for path, target in targets.items():
         target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..diagnostics import Diagnostic
-from ..errors import BadOption, MissingFile, WrongOption, one_of
+from ..errors import BadOption, WrongOption, one_of
 from . import options as opt
 from .options import described_by
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
@@ -46,7 +46,7 @@ def view(
     """
     import webbrowser
 
-    from ..documents import check_output, whole_file
+    from ..documents import whole_file
     from ..report.viewer import pose_html
     from ..writers import load_result, select_pose
 
@@ -54,10 +54,7 @@ def view(
         option = f"phase {phase}" if interval is None else "interval {:g} {:g}".format(*interval)
         raise BadOption(f"--{option}: needs -o FILE; view.html in the result shows the whole recording")
     page = out or result / "view.html"
-    if not (result / "pose.parquet").is_file():
-        raise MissingFile(f"{result}: no pose.parquet in it; a folder that `wepose track` wrote is needed")
     if out is not None or force or not page.is_file():
-        check_output(page, force)
         with progress_bar() as progress:
             progress("making the page", 0.0)
             tracked = load_result(result)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -111,7 +111,6 @@ class GuideStep(NamedTuple):
     name: str
     title: str
     run: Callable[[Guide, bool], StepRun]
-    before_attempt: bool = False  # sensors and their segments may still change: the recording begins after it
     records: bool = True  # the attempt goes on recording; else its samples wait for the next step
 
 
@@ -202,11 +201,9 @@ class Guide(Stage):
             self._begin(ended.value)
 
     def _begin(self, name: str) -> None:
-        """Begin the step of this name, "": the next one; where sensors may change, a new attempt begins after it."""
+        """Begin the step of this name, "": the next one."""
         while True:
             self._index = [step.name for step in self.steps].index(name) if name else self._index + 1
-            if self.step.before_attempt:
-                self.close()
             self.ticks, self._running = [], self.step.run(self, bool(name))
             try:
                 self._view = next(self._running)
@@ -254,14 +251,11 @@ class Guide(Stage):
             segment = self.segments.get(name, name)
             label = name if segment == name else f"{segment} ({name})"
             sensors.append(SensorStatus(label, rate_hz, name in self.silent))
-        status = Status("waiting", "The subject is saved. Tracking begins.", 0.0, self.now, tuple(sensors))
-        status = status._replace(problems=dict(self.source.problems))
+        about: dict[str, Any] = {"time": self.now, "sensors": tuple(sensors), "problems": dict(self.source.problems)}
         if self.is_over:
-            return status
-        view, actions = self.view(), self.actions
-        return status._replace(
-            state="guide", message=view.sentence, progress=view.progress, actions=actions, guide=view
-        )
+            return Status("waiting", "The subject is saved. Tracking begins.", **about)
+        view = self.view()
+        return Status("guide", view.sentence, view.progress, actions=self.actions, guide=view, **about)
 
     def describe_problems(self) -> str:
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""

@@ -89,8 +89,8 @@ def make_steps(protocol: Protocol) -> list[GuideStep]:
     for phase in {motion.phase for motion in motions} & {"sensors", "assignment", "quality"}:
         raise BadOption(f"--protocol {protocol.name}: phase '{phase}' has the name of a step of --guide; rename it")
     return [
-        GuideStep("sensors", "Sensors", find_sensors, before_attempt=True),
-        GuideStep("assignment", "Segments", assign_segments, before_attempt=True),
+        GuideStep("sensors", "Sensors", find_sensors),
+        GuideStep("assignment", "Segments", assign_segments),
         GuideStep("start", "Start pose", hold_start_pose),
         *(GuideStep(m.phase, m.phase.replace("_", " ").capitalize(), partial(perform_motion, m)) for m in motions),
         GuideStep("quality", "Result", show_result, records=False),
@@ -101,6 +101,7 @@ def make_steps(protocol: Protocol) -> list[GuideStep]:
 
 
 def find_sensors(guide: Guide, _: bool) -> StepRun:
+    guide.close()  # sensors may change: a new attempt begins
     needed = len(guide.options.joined.needs)
     while True:
         count, awaited = len(guide.monitor.sending) - len(guide.silent), guide.source.describe_awaited()
@@ -115,6 +116,7 @@ def find_sensors(guide: Guide, _: bool) -> StepRun:
 
 def assign_segments(guide: Guide, asked_for: bool) -> StepRun:
     """Find by shaking which sensor sits on which segment; the ends of limbs first: the forearm moves with the arm."""
+    guide.close()
     needs, chains = guide.options.joined.needs, guide.options.model.chains
     order = sorted(needs, key=lambda name: chains[name][-1:], reverse=True)
     if not asked_for:

@@ -9,14 +9,16 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from ..arguments import Range
 from ..body.urdf import find_example_data, read_urdf
-from ..documents import Finite, Key, TomlTable, read_record, read_toml
+from ..documents import Key, TomlTable, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
 from ..libraries import asset
 from ..recording import AXES
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
+Limit = Annotated[float, Range(-1e6, closed=True, high=1e6)]  # of a joint [rad or m, s]
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
 
@@ -195,14 +197,14 @@ def _check_axes(table: TomlTable, first: str, second: str) -> None:
 
 def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[str, float]:
     """Read one number for all joints, or a table with a number for each."""
-    value = limits.get(key, {}, Finite | Mapping[str, Finite])
+    value = limits.get(key, {}, Limit | Mapping[str, Limit])
     values = value if isinstance(value, Mapping) else dict.fromkeys(joints, value)
     return {name: float(number) for name, number in values.items()}
 
 
 def _read_ranges(limits: TomlTable) -> dict[str, tuple[float, ...]]:
     """Read joint → lower and upper limit."""
-    ranges = limits.get("position", {}, Mapping[str, tuple[Finite, Finite]])
+    ranges = limits.get("position", {}, Mapping[str, tuple[Limit, Limit]])
     for name, (lower, upper) in ranges.items():
         if not lower < upper:
             raise BadModel(f"{limits.at('position')}.{name} = [{lower:g}, {upper:g}]; the first must be smaller")
