@@ -16,33 +16,11 @@ import numpy as np
 
 from ..compilation import compiled
 from ..rotations import fill_matrix, rotate_by_world_vector
-from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, AmekfParams, make_records, run
+from . import amekf
+from .amekf import BLOCK, PROPAGATED_STATES, SMOOTHED_STATES, STATES
 from .base import HEADING, RATE, RATE_VAR, OrientationFilter, into_sensor
 
 COUNT = len(SMOOTHED_STATES)
-
-
-@compiled
-def _transpose_transition(block, gravity, L):  # type: ignore[no-untyped-def]
-    """In place ``L ← Fᵀ L`` of `L` (25, m), F the transition that `amekf.fill_transition_rows` applies."""
-    bias, moving = L[ERROR.gyro_bias], L[ERROR.motion_bias]
-    matrix, force = L[ERROR.gyro_matrix], L[ERROR.accel_bias]
-    R, R_moving, R_rate = block.R, block.R_moving, block.R_rate
-    g, t = 0.5 * block.length * gravity, 0.5 * block.length
-    for j in range(L.shape[1]):
-        # Adjoints of the rows v⁺ and θ⁺, with what p⁺ and v⁺ take of them; then the direct shares.
-        px, py = t * L[POSITION, j], t * L[POSITION + 1, j]
-        vx, vy = L[VELOCITY, j] + px, L[VELOCITY + 1, j] + py
-        L[VELOCITY, j], L[VELOCITY + 1, j] = vx + px, vy + py
-        tx, ty = L[0, j] - g * vy, L[1, j] + g * vx
-        tz = L[2, j]
-        L[0, j], L[1, j] = tx - g * vy, ty + g * vx
-        for c in range(3):
-            force[c, j] -= R[0, c] * vx + R[1, c] * vy
-            bias[c, j] -= R[0, c] * tx + R[1, c] * ty + R[2, c] * tz
-            moving[c, j] -= R_moving[0, c] * tx + R_moving[1, c] * ty + R_moving[2, c] * tz
-            for w in range(3):
-                matrix[3 * c + w, j] -= R_rate[w, 0, c] * tx + R_rate[w, 1, c] * ty + R_rate[w, 2, c] * tz
 
 
 @compiled
@@ -53,6 +31,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
     deviation = np.empty((len(blocks) + 1, COUNT))
     covs = np.empty((2, len(blocks) + 1, 3, 3))
     lam, Lam, rows, cov = np.zeros((STATES, 1)), np.zeros((STATES, STATES)), start_rows.copy(), np.empty((COUNT, COUNT))
+    F, identity = np.eye(STATES), np.eye(STATES)
     for k in range(len(blocks), -1, -1):
         rows[:] = start_rows
         if k > 0:
@@ -73,11 +52,10 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
             Lam[at] -= u
             Lam[:, at] -= u
             Lam[at, at] += root * (root + np.dot(gain, u))
-        _transpose_transition(block, gravity, lam)
-        _transpose_transition(block, gravity, Lam)
-        swapped = Lam.T.copy()
-        _transpose_transition(block, gravity, swapped)
-        Lam[:] = 0.5 * (swapped + swapped.T)
+        amekf.fill_transition_rows(block, gravity, identity, F[:PROPAGATED_STATES])
+        lam[:] = np.dot(F.T, lam)
+        Lam[:] = np.dot(np.dot(F.T, Lam), F)
+        Lam[:] = 0.5 * (Lam + Lam.T)
     return deviation, covs[0].reshape(-1, 9), covs[1].reshape(-1, 9)
 
 
@@ -130,9 +108,9 @@ def _smooth(states: np.ndarray, models: np.ndarray, *arrays: np.ndarray) -> None
     P_rows, size = states["P"][0, list(SMOOTHED_STATES), :STATES], int(models["block_samples"][0])
     (gyro_S, _, static), out = arrays[:3], arrays[3:]
     blocks = np.empty(len(gyro_S) // size, BLOCK)
-    run(states.copy(), models, blocks, *arrays)
+    amekf.run(states.copy(), models, blocks, *arrays)
     smoothed = _backward(blocks, P_rows, float(models["gravity"][0]))
     _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, static, *out)
 
 
-SMOOTHER = OrientationFilter(make_records, _smooth, AmekfParams)
+SMOOTHER = OrientationFilter(amekf.make_records, _smooth, amekf.AmekfParams)
