@@ -110,7 +110,7 @@ def live_log() -> bytes:
     def add(topic: str, **values: object) -> None:
         writer.add_message(channels[topic], 0, json.dumps(values).encode(), 0)
 
-    add("/events", kind="clock", rate_hz=100.0, begin=0.0, wait_s=0.5)
+    add("/events", kind="clock", rate_hz=100.0, begin=0.0)
     for k in range(100):
         add("/sensors/torso", t=k / 100.0, gyro=[0.0, 0.0, 0.0], accel=[0.0, 0.0, 9.8])
     add("/events", kind="start", begin=0, end=50)

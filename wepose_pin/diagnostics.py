@@ -15,6 +15,7 @@ from enum import StrEnum
 from functools import lru_cache
 from html import escape
 from pathlib import Path
+from string import Formatter
 from types import MappingProxyType
 from typing import Any
 
@@ -162,17 +163,15 @@ def quantity(value: float | None, unit: str) -> str:
     return (text.rstrip("0").rstrip(".") if "." in text else text) + name
 
 
+class _Formatter(Formatter):
+    """Fills in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
+
+    def format_field(self, value: Any, unit: str) -> str:
+        return str(value).replace("_", " ") if unit == "name" else quantity(value, unit) if unit else str(value)
+
+
 def _fill(template: str, known: Mapping[str, Any]) -> str:
-    """Fill in a text: ``{value:deg}`` with its unit, ``{place:name}`` a name in words, ``{reason}`` as it is."""
-
-    def write(match: re.Match[str]) -> str:
-        if match[1] is None:
-            return match[0][0]  # a doubled brace
-        value, unit = known[match[1]], match[2]
-        text = quantity(value, unit) if unit and unit != "name" else str(value)
-        return text.replace("_", " ") if unit == "name" else text
-
-    text = re.sub(r"\{\{|\}\}|\{(\w+)(?::([^}]+))?\}", write, template)
+    text = _Formatter().vformat(template, (), known)
     # A name at the beginning of a sentence; a file's name stays as it is.
     return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
 

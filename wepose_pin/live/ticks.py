@@ -118,7 +118,7 @@ class Recorder:
     ) -> None:
         self.sensors, self.orientations, self.header = tuple(source.sensors), source.orientations, header
         self.log, self._markers = LiveLog(path, header, force), Markers()
-        self.clock = StreamSynchronizer(self.sensors, DEFAULT_RATE_HZ, 0.0, orientations=self.orientations)
+        self.clock = StreamSynchronizer(self.sensors, DEFAULT_RATE_HZ, 0.0, self.orientations)
         self.has_begun, self.ticks = False, list[Ticks]()
         self._rate_hz, self._begin = source.rate_hz, source.begin
         self._waiting: list[Arrivals] = []
@@ -162,9 +162,9 @@ class Recorder:
                 return
             rates = [1.0 / step for step in map(measure_step, times) if step]
             rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ  # that of the slowest sensor
-        self.clock = StreamSynchronizer(self.sensors, rate, begin, orientations=self.orientations)
+        self.clock = StreamSynchronizer(self.sensors, rate, begin, self.orientations)
         self.has_begun = True
-        self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self.clock.wait_s)
+        self.log.event("clock", rate_hz=rate, begin=begin)
 
     def mark(self, kind: str, **values: Any) -> None:
         """Record an event: the begin or end of a phase, or what is discarded of it."""

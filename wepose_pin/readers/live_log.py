@@ -103,8 +103,8 @@ def read_live_log(path: Path) -> LiveRecording:
         clock, start = by_kind["clock"], None
         if not 0.1 <= clock["rate_hz"] <= MOST_RATE:
             raise BadData(f"{path}: ticks at {clock['rate_hz']:g} Hz; the file is damaged")
-        timing = clock["rate_hz"], clock["begin"], clock["wait_s"]
-        synchronizer = StreamSynchronizer(header["sensors"], *timing, header["orientations"])
+        begin, orientations = clock["begin"], header["orientations"]
+        synchronizer = StreamSynchronizer(header["sensors"], clock["rate_hz"], begin, orientations)
         ticks = [*synchronizer.push(arrivals)]
         if "start" in by_kind:
             start = int(by_kind["start"]["begin"]), int(by_kind["start"]["end"])

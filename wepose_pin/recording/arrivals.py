@@ -64,9 +64,8 @@ SENSOR = np.dtype(
     ],
     align=True,
 )
-CLOCK = np.dtype(
-    [("begin", float), ("dt", float), ("wait_s", float), ("tick", np.int64), ("newest", float)], align=True
-)  # `tick` of the next one, `newest` time [s] of all sensors
+# `tick` of the next one, `newest` time [s] of all sensors
+CLOCK = np.dtype([("begin", float), ("dt", float), ("tick", np.int64), ("newest", float)], align=True)
 
 
 class Samples(NamedTuple):
@@ -130,7 +129,7 @@ class StreamSynchronizer:
     """Makes ticks of one even clock from samples that may arrive out of order, twice, late or not at all.
 
     A tick is complete as soon as every sensor has reached it. It waits `REORDER_S` for a sample that others of its
-    sensor have overtaken and `wait_s` for a silent sensor, both measured on the samples' times. Then the sensor is
+    sensor have overtaken and `WAIT_S` for a silent sensor, both measured on the samples' times. Then the sensor is
     lost, and ticks do not wait for it until its next sample. A sample at a tick is used unchanged. Between ticks the
     rate is the mean over the step, and specific force and measured orientations are interpolated. Gaps of up to
     `LONGEST_GAP_S` are bridged linearly; longer ones are NaN. So are the samples of a frozen sensor until they change,
@@ -141,27 +140,21 @@ class StreamSynchronizer:
     sensors : segments, in the order of the ticks' columns
     rate_hz : ticks a second
     begin : time [s] of tick 0
-    wait_s : [s] that a tick waits for a silent sensor
     orientations : the sensors whose samples are measured orientations
     """
 
     def __init__(
-        self,
-        sensors: Sequence[str],
-        rate_hz: float,
-        begin: float,
-        wait_s: float = WAIT_S,
-        orientations: Collection[str] = (),
+        self, sensors: Sequence[str], rate_hz: float, begin: float, orientations: Collection[str] = ()
     ) -> None:
-        self.sensors, self.rate_hz, self.begin, self.wait_s = tuple(sensors), rate_hz, begin, wait_s
+        self.sensors, self.rate_hz, self.begin = tuple(sensors), rate_hz, begin
         k = len(self.sensors)
-        self._clock = np.array([(begin, 1.0 / rate_hz, wait_s, 0, -np.inf)], CLOCK)
+        self._clock = np.array([(begin, 1.0 / rate_hz, 0, -np.inf)], CLOCK)
         self._sensors = state = np.zeros(k, SENSOR)
         state["is_orientation"] = [name in orientations for name in self.sensors]
         state["saturation"], state["newest"], state["value"] = start_saturation(), -np.inf, np.nan
         self.counts, self.lost, self.frozen = state["counts"], state["lost"], state["frozen"]
         # A sensor may be much faster than the ticks.
-        room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
+        room = 4096 + int(8.0 * rate_hz * WAIT_S)
         self._buffers = np.zeros((k, room, 7))
         self._out = np.empty((_OUT, k, 6)), np.empty((_OUT, k), dtype=np.bool_)
 
@@ -275,7 +268,7 @@ def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-de
     # Only the first tick has no tick before it: a sample before the beginning is the start of its step.
     if clock.tick > 0 and t < clock.begin + (clock.tick - 1.0 + SAME) * dt:
         sensor.counts[LATE] += 1
-        if t > clock.newest - clock.wait_s:
+        if t > clock.newest - WAIT_S:
             sensor.lost = False  # the next tick waits for it again
         return
     if sensor.buffered == len(buffer):  # it is ahead by a full buffer and no tick is complete: drop the oldest sample
@@ -314,13 +307,13 @@ def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-unty
         return False
     for s in range(len(sensors)):
         buffer, n = buffers[s], sensors[s].buffered
-        if sensors[s].lost or clock.newest >= t + clock.wait_s:
+        if sensors[s].lost or clock.newest >= t + WAIT_S:
             continue
         if n == 0 or buffer[n - 1, 0] < t - SAME * dt:
             return False
         if buffer[n - 1, 0] < t + REORDER_S:
             i = _find_sample(buffer, n, t - SAME * dt)
-            if i > 0 and buffer[i, 0] - buffer[i - 1, 0] > HOLE * dt and buffer[i - 1, 0] > t - clock.wait_s:
+            if i > 0 and buffer[i, 0] - buffer[i - 1, 0] > HOLE * dt and buffer[i - 1, 0] > t - WAIT_S:
                 return False  # a sample in the gap may still arrive
     for s in range(len(sensors)):
         sensor, buffer, n, level = sensors[s], buffers[s], sensors[s].buffered, sensors[s].saturation.level
