@@ -30,13 +30,13 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
     start, whose rows of P are `start_rows`."""
     deviation = np.empty((len(blocks) + 1, COUNT))
     covs = np.empty((2, len(blocks) + 1, 3, 3))
-    lam, Lam, rows, cov = np.zeros((STATES, 1)), np.zeros((STATES, STATES)), start_rows.copy(), np.empty((COUNT, COUNT))
+    lam, Lam, rows, cov = np.zeros(STATES), np.zeros((STATES, STATES)), start_rows.copy(), np.empty((COUNT, COUNT))
     F, identity = np.eye(STATES), np.eye(STATES)
     for k in range(len(blocks), -1, -1):
         rows[:] = start_rows
         if k > 0:
             rows[:] = blocks[k - 1].P_smoothed_rows
-        deviation[k] = -np.dot(rows, lam[:, 0].copy())
+        deviation[k] = -np.dot(rows, lam)
         for n in range(COUNT):
             cov[:, n] = rows[:, SMOOTHED_STATES[n]]
         cov -= np.dot(np.dot(rows, Lam), rows.T)
@@ -46,9 +46,9 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
             break
         block = blocks[k - 1]
         for n in range(block.measurements - 1, -1, -1):  # λ and Λ before a measurement from those after it
-            at, root, gain = block.state_index[n], block.inv_innovation_std[n], block.normalized_gain[n].copy()
+            at, root, gain = block.state_index[n], block.inv_innovation_std[n], block.normalized_gain[n, :STATES].copy()
             u = root * np.dot(Lam, gain)
-            lam[at, 0] -= root * (np.dot(gain, lam[:, 0].copy()) + block.normalized_innovation[n])
+            lam[at] -= root * (np.dot(gain, lam) + block.normalized_innovation[n])
             Lam[at] -= u
             Lam[:, at] -= u
             Lam[at, at] += root * (root + np.dot(gain, u))
