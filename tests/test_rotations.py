@@ -28,8 +28,8 @@ def test_exp_is_the_matrix_exponential(angle: float) -> None:
     np.testing.assert_allclose(Rotation.from_quat(quat).as_matrix(), matrix, atol=1e-14)
 
 
-@pytest.mark.parametrize("scale", [1e-3, 0.9, 1 - 1e-8, 1 - 1e-9, 1 + 1e-9, 1 + 1e-8, 1.1, 1e3])
-def test_the_compiled_step_renormalises_on_both_sides_of_its_switch(scale: float) -> None:
+@pytest.mark.parametrize("scale", [1 - 1e-9, 1 + 1e-9])
+def test_the_compiled_step_renormalises(scale: float) -> None:
     start = Rotation.from_rotvec([0.3, -0.5, 0.9]).as_quat()
     quat, unit = scale * start, start.copy()
     rotations.rotate_by_vector(quat, 0.1, 0.2, -0.3)
@@ -82,20 +82,19 @@ def test_products_of_arrays_are_scipys() -> None:
 
 
 @njit
-def _kernels(quat, rate, dt, by_rate, in_world, R):  # type: ignore[no-untyped-def]
-    """What the kernels that are parts of others make of a rotation; they cannot be called from here."""
-    by_rate[:], in_world[:] = quat, quat
-    rotations.rotate_unit_by_rate(by_rate, rate[0], rate[1], rate[2], dt)
-    rotations.rotate_by_world_vector(in_world, rate[0] * dt, rate[1] * dt, rate[2] * dt)
-    rotations.fill_matrix(quat, R)
+def _rotate_in_world(quat, x, y, z):  # type: ignore[no-untyped-def]
+    """Call the kernel that is a part of others and cannot be called from here."""
+    rotations.rotate_by_world_vector(quat, x, y, z)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_kernels_on_both_sides_of_their_switches(angle: float) -> None:
-    dt, axis, start = 0.01, np.array([0.36, -0.48, 0.8]), Rotation.from_rotvec([0.3, -0.5, 0.9])
-    by_rate, in_world, R = np.empty(4), np.empty(4), np.empty((3, 3))
-    _kernels(start.as_quat(), angle / dt * axis, dt, by_rate, in_world, R)
+    axis, start = np.array([0.36, -0.48, 0.8]), Rotation.from_rotvec([0.3, -0.5, 0.9])
+    in_sensor, in_world, R = start.as_quat(), start.as_quat(), np.empty((3, 3))
+    rotations.rotate_by_vector(in_sensor, *(angle * axis))
+    _rotate_in_world(in_world, *(angle * axis))
+    rotations.fill_matrix(start.as_quat(), R)
     turn = Rotation.from_rotvec(angle * axis)
-    np.testing.assert_allclose(Rotation.from_quat(by_rate).as_matrix(), (start * turn).as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(Rotation.from_quat(in_sensor).as_matrix(), (start * turn).as_matrix(), atol=1e-14)
     np.testing.assert_allclose(Rotation.from_quat(in_world).as_matrix(), (turn * start).as_matrix(), atol=1e-14)
     np.testing.assert_allclose(R, start.as_matrix(), atol=1e-15)

@@ -112,10 +112,8 @@ def wrap_angle(angle: np.ndarray) -> np.ndarray:
 
 def unwrap_signs(quat: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """The same rotations (n, 4) with signs by which neighbours lie on one side, and the first with `before` (4,)."""
-    jumps = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))
-    first = 1.0 if before is None else np.sign(quat[0] @ before)
-    signs = np.concatenate([[first], jumps])
-    signs[signs == 0.0] = 1.0
+    earlier = np.concatenate([quat[:1] if before is None else before[None], quat[:-1]])
+    signs = np.where(np.einsum("ni,ni->n", quat, earlier) < 0.0, -1.0, 1.0)
     return quat * np.cumprod(signs)[:, None]
 
 
@@ -140,15 +138,14 @@ def half_angle_terms(h1):  # type: ignore[no-untyped-def]
 
 @kernel
 def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more: its first four, xyzw; [rad]."""
-    s, c = half_angle_terms(0.25 * (x * x + y * y + z * z))
-    ex, ey, ez = s * x, s * y, s * z
-    qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
-    rx, ry, rz, rw = product(qx, qy, qz, qw, ex, ey, ez, c)
-    square = rx * rx + ry * ry + rz * rz + rw * rw
-    # Of an almost unit quaternion 1/norm is 1 − (square − 1)/2, to 3/8 (square − 1)².
-    scale = 1.5 - 0.5 * square if abs(square - 1.0) < 1e-8 else 1.0 / np.sqrt(square)
-    quat[0], quat[1], quat[2], quat[3] = rx * scale, ry * scale, rz * scale, rw * scale
+    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised to first order: but for rounding it is unit.
+
+    `quat` (4,) or more: its first four, xyzw; x, y, z [rad]
+    """
+    s, ew = half_angle_terms(0.25 * (x * x + y * y + z * z))
+    rx, ry, rz, rw = product(quat[0], quat[1], quat[2], quat[3], s * x, s * y, s * z, ew)
+    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order
+    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 
 def turned(quat: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
@@ -156,16 +153,6 @@ def turned(quat: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
     result = quat.copy()
     rotate_by_vector(result, *rotvec)
     return result
-
-
-@inlined
-def rotate_unit_by_rate(quat, wx, wy, wz, dt):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← quat ⊗ exp([wx, wy, wz] dt)``, renormalised to first order: but for rounding it is unit."""
-    s, ew = half_angle_terms(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
-    s *= dt
-    rx, ry, rz, rw = product(quat[0], quat[1], quat[2], quat[3], s * wx, s * wy, s * wz, ew)
-    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order
-    quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 
 @inlined

@@ -28,7 +28,7 @@ import numpy as np
 from ..arguments import NonNegative, Positive, PositiveOrInfinite
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
-from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
+from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector
 from . import base
 from .phases import SensorNoise
 
@@ -263,7 +263,7 @@ def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-unty
     wy = uy - (M[3] * ux + M[4] * uy + M[5] * uz)
     wz = uz - (M[6] * ux + M[7] * uy + M[8] * uz)
     state.rate_squared += wx * wx + wy * wy + wz * wz
-    rotate_unit_by_rate(state.quat_VS, wx, wy, wz, dt)
+    rotate_by_vector(state.quat_VS, wx * dt, wy * dt, wz * dt)
     fill_matrix(state.quat_VS, R)
     for i in range(3):
         for c in range(3):

@@ -24,7 +24,7 @@ import numpy as np
 from ..arguments import NonNegative, PositiveOrInfinite
 from ..compilation import compiled, fma, inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
-from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector, rotate_unit_by_rate, up_in_sensor
+from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector, up_in_sensor
 from . import base
 from .phases import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
 
@@ -138,7 +138,7 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
         wx, wy, wz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
-        rotate_unit_by_rate(quat, wx, wy, wz, dt)
+        rotate_by_vector(quat, wx * dt, wy * dt, wz * dt)
         fill_matrix(quat, R)
         A, C, B = _predict(A, C, B, R, model, lost_var)
         if static[k] and is_measured and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
