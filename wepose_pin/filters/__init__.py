@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..arguments import check_arguments, check_value
+from ..arguments import Positive, check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
@@ -217,7 +217,7 @@ def average_start(
 def estimate_orientation(
     gyro_S: np.ndarray,
     accel_S: np.ndarray,
-    rate_hz: float,
+    rate_hz: Positive,
     *,
     method: str = BEST,
     static: tuple[float, float] | None,
@@ -288,8 +288,6 @@ def estimate_orientation(
         gyro, accel = (np.asarray(values, dtype=float, order="C") for values in (gyro_S, accel_S))
     except (TypeError, ValueError) as error:
         raise BadData(f"gyro_S and accel_S must be arrays of numbers (n, 3): {error}") from None
-    if not (np.isfinite(rate_hz) and rate_hz > 0.0 and (static is None or np.isfinite(static).all())):
-        raise BadOption(f"rate_hz = {rate_hz} and static = {static}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     limits = ("gyro_S", gyro, HIGHEST_RATE, "rad/s"), ("accel_S", accel, HIGHEST_ACCEL, "m/s^2")
@@ -308,10 +306,11 @@ def estimate_orientation(
         diagnostics = (Diagnostic("static-phase-missing", WARNING, facts=facts),)
         warnings.warn(join_text(render(diagnostics[0])), WeposeWarning, stacklevel=2)
     else:
-        first, last = round(static[0] * rate_hz), round(static[1] * rate_hz) + 1
-        if not 0 <= first < last <= len(gyro) + 1:
+        first, last = np.round(np.multiply(static, rate_hz)) + (0.0, 1.0)
+        if not 0.0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
-        noise, start = estimate_noise(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
+        start = slice(int(first), int(last))
+        noise = estimate_noise(gyro[start], accel[start], rate_hz)
     sensor = ImuSensor(gyro, accel, gyro_range=find_gyro_range(gyro, accel))
     filters = SensorFilters({"": noise}, method=method, params=params, static_test=static_test, start=start)
     return filters.push(Recording("", np.empty(len(gyro)), rate_hz, {"": sensor}))[""]._replace(diagnostics=diagnostics)

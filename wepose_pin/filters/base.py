@@ -106,7 +106,7 @@ def make_record(**values: Any) -> np.ndarray:
 
 
 class FilterParams:
-    """Parameters of a filter, checked against their annotations."""
+    """Parameters of a filter or of the static test, checked against their annotations."""
 
     def __post_init__(self) -> None:
         check_fields(self, "")

@@ -19,9 +19,9 @@ from typing import Annotated
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
-from ..arguments import NonNegative, PositiveOrInfinite, Range, check_fields
+from ..arguments import NonNegative, PositiveOrInfinite, Range
 from ..compilation import inlined, kernel
-from .base import make_record
+from .base import FilterParams, make_record
 from .phases import BLOCK_S, SensorNoise
 
 NEWEST_S = 0.05  # [s] of condition (6), about as long as the fastest smooth motion takes to begin
@@ -39,7 +39,7 @@ _UPPER = np.triu_indices(3)
 
 
 @dataclass(frozen=True)
-class StaticTest:
+class StaticTest(FilterParams):
     """When a sensor counts as static: where all six conditions hold for the window that ends with the sample.
 
     Conditions (1) to (4) and their limits are those of Lisini Baldi et al. 2019, who do not state a window. (5) and (6)
@@ -64,9 +64,6 @@ class StaticTest:
     gamma1: NonNegative = 0.01
     gamma2: NonNegative = 0.01
     rate_stds: PositiveOrInfinite = 3.0
-
-    def __post_init__(self) -> None:
-        check_fields(self, "")
 
     def samples(self, rate_hz: float) -> int:
         """Return the window's length in samples, at least 4: a covariance of three axes needs them."""
