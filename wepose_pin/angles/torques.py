@@ -78,8 +78,8 @@ def joint_torques(
         elif n == 1 and "Prismatic" not in model.joints[joint].shortname():
             q[:, first] = np.unwrap(q[:, first])
     # The motion is mirrored for a second beyond each end, where the filter's transient decays.
-    pad = min(len(time) - 1, max(_LEAST_SAMPLES - 1, round(rate_hz)))
-    q = np.array([pin.normalize(model, row) for row in low_pass(q, cutoff_hz, rate_hz, pad)])
+    q = low_pass(q, cutoff_hz, rate_hz, max(_LEAST_SAMPLES - 1, round(rate_hz)))
+    q = np.array([pin.normalize(model, row) for row in q])
     # Central differences; the ends repeat.
     half = np.array([pin.difference(model, a, b) for a, b in pairwise(q)]) * rate_hz
     v = np.concatenate((half[:1], 0.5 * (half[1:] + half[:-1]), half[-1:]))

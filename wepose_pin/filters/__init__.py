@@ -134,8 +134,6 @@ class SensorFilters:
         A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
         """
         gyro_S, accel_S = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
-        if gyro_S.shape != self.gyro_bias.shape or accel_S.shape != self.gyro_bias.shape:
-            raise BadData(f"gyro_S {gyro_S.shape} and accel_S {accel_S.shape}: {len(self.names)} rows of three")
         for i, name in enumerate(self.names):
             _run(self._filter, self._records[name], (gyro_S[i : i + 1], accel_S[i : i + 1]), self._rows[i])
         return self.quat_VS

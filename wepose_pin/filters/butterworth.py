@@ -10,7 +10,7 @@ from ..compilation import kernel
 def low_pass(values: np.ndarray, cutoff_hz: float, rate_hz: float, pad: int | None = None) -> np.ndarray:
     """Signals (n, …) without what is faster than `cutoff_hz`; their ends are mirrored by `pad` samples.
 
-    `pad` < n; None: as SciPy.
+    `pad` None: as SciPy; no more than there are.
     """
     return _filter_both_ways(_design((None, cutoff_hz), rate_hz), values, pad)
 
@@ -49,9 +49,7 @@ def _design(band_hz: tuple[float | None, float], rate_hz: float) -> np.ndarray:
 
 def _filter_both_ways(sections: np.ndarray, values: np.ndarray, pad: int | None = None) -> np.ndarray:
     n, columns = len(values), values.reshape(len(values), -1)
-    pad = 3 * (2 * len(sections) + 1) if pad is None else pad
-    if n <= pad:
-        raise ValueError(f"{n} samples, and more than {pad} are needed")
+    pad = min(n - 1, 3 * (2 * len(sections) + 1) if pad is None else pad)
     first, last = 2.0 * columns[0] - columns[pad:0:-1], 2.0 * columns[-1] - columns[-2 : -pad - 2 : -1]
     signals = np.concatenate((first, columns, last))
     for _ in range(2):

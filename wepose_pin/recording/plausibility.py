@@ -64,11 +64,10 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
         good = (np.abs(sensor.gyro_S) < sensor.gyro_range).all(axis=1)  # a rate at the limit varies least of all
         good = good if sensor.gap is None else good & ~sensor.gap
         size = min(len(good), max(2, round(recording.rate_hz)))
-        count = len(good) // size
-        motion = sensor.gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
-        motion[~good[: count * size].reshape(count, size).all(axis=1)] = np.inf
-        second = int(np.argmin(motion))
-        static = np.arange(second * size, (second + 1) * size if np.isfinite(motion[second]) else second * size)
+        seconds = np.arange(len(good) // size * size).reshape(-1, size)
+        seconds = seconds[good[seconds].all(axis=1)]
+        motion = sensor.gyro_S[seconds].var(axis=1).sum(axis=1)
+        static = seconds[np.argmin(motion)] if len(seconds) else np.arange(0)
         when = "in the second in which it turns most evenly"
     if len(static) < 2:
         return []
@@ -98,14 +97,14 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     size = min(round(WINDOW_S * rate_hz), len(sensor.gyro_S) // FEWEST_WINDOWS)
     if size < SHORTEST_WINDOW_S * rate_hz:
         return
-    count = len(sensor.gyro_S) // size
-    gyro, accel = (values[: count * size].reshape(count, size, 3) for values in (sensor.gyro_S, sensor.accel_S))
-    motion = np.linalg.norm(gyro, axis=2).mean(axis=1) + np.linalg.norm(accel.std(axis=1), axis=1) / STANDARD_GRAVITY
+    windows = np.arange(len(sensor.gyro_S) // size * size).reshape(-1, size)
     if sensor.gap is not None:  # without bridged samples
-        motion[sensor.gap[: count * size].reshape(count, size).any(axis=1)] = -1.0
-    moving = np.argsort(-motion, kind="stable")[: min(WINDOWS, np.count_nonzero(motion >= 0.0))]
-    if len(moving) < FEWEST_WINDOWS:
+        windows = windows[~sensor.gap[windows].any(axis=1)]
+    if len(windows) < FEWEST_WINDOWS:
         return
+    gyro, accel = sensor.gyro_S[windows], sensor.accel_S[windows]
+    motion = np.linalg.norm(gyro, axis=2).mean(axis=1) + np.linalg.norm(accel.std(axis=1), axis=1) / STANDARD_GRAVITY
+    moving = np.argsort(-motion, kind="stable")[:WINDOWS]
 
     def average_coherence(scale: float) -> float:
         """0 to 1; the specific force of a swinging arm is several times gravity, its mean in the world is gravity."""
