@@ -10,7 +10,7 @@ import sys
 import numpy as np
 
 import wepose_pin as wp
-from wepose_pin.angles import summary_table
+from wepose_pin.angles import summary
 
 if len(sys.argv) > 1:
     recording = wp.load_session(sys.argv[1])
@@ -23,5 +23,8 @@ result = wp.track(recording, subject)
 angles = wp.joint_angles(result)
 flexion = np.degrees(angles["right_elbow"]["flexion"])  # (n,)
 print(f"right elbow's flexion: {flexion.min():.0f} to {flexion.max():.0f} deg")
-print(summary_table(angles).select("joint", "angle", "lowest_deg", "highest_deg", "range_deg"))
+for joint, ranges in summary(angles).items():
+    extremes = zip(np.degrees(ranges.lowest), np.degrees(ranges.highest), strict=True)
+    for name, (lowest, highest) in zip(angles[joint], extremes, strict=True):
+        print(f"{joint} {name}: {lowest:.0f} to {highest:.0f} deg")
 result.plot().save("figures", force=True)

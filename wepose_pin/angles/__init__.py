@@ -18,4 +18,3 @@ from .joints import group_sides as group_sides
 from .joints import joint_angles as joint_angles
 from .movement import angle_table as angle_table
 from .movement import summary as summary
-from .movement import summary_table as summary_table

@@ -218,21 +218,6 @@ def angle_table(angles: Angles) -> pl.DataFrame:
     return pl.DataFrame(table)
 
 
-def summary_table(angles: Angles) -> pl.DataFrame:
-    """`summary` in degrees, a row an angle; values of the joint are in each of its three rows."""
-    return pl.DataFrame(
-        {
-            "joint": name,
-            "angle": angle,
-            **{f"{measure}_{unit}": np.degrees(getattr(ranges, measure)[k]) for measure, unit in MEASURES.items()},
-            "joint_near_lock": ranges.near_lock,
-            "joint_gap": ranges.gap,
-        }
-        for name, ranges in summary(angles).items()
-        for k, angle in enumerate(angles[name].names)
-    )
-
-
 def build_tables(movements: Sequence[Movement]) -> dict[str, pl.DataFrame]:
     """Build all tables, by the names of their files; one without rows is empty."""
     angles = [angle_table(each.angles).select(pl.lit(each.name).alias("session"), pl.all()) for each in movements]

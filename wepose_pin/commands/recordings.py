@@ -46,7 +46,7 @@ def info(
         Propose the segments of this body, such as whole_body (docs/models.md). Without it, those of the upper body.
     """
     from ..body import load_model
-    from ..documents import check_output, whole_file
+    from ..documents import whole_file
     from ..readers.describe import describe_file, find_file
 
     with progress_bar() as progress:
@@ -55,8 +55,6 @@ def info(
         file = find_file(file, body)
         session = out or file.absolute().parent / "session.toml"
         writes = write or out is not None
-        if writes:
-            check_output(session, force)
         description = describe_file(file, session.absolute().parent, body, None if model is None else Path(model))
         if writes:
             if description.session is None:

@@ -30,7 +30,6 @@ from ..recording.arrivals import COUNTS, CUT_OFF, MISSING, Samples, Ticks
 from ..recording.plausibility import find_unseen_rate
 from ..tracking import Tracker
 from ..tracking.heading_filter import CAUSAL_KNOT_S
-from ..writers.live_log import check_absent
 from ..writers.result import versions
 from .setup import SensorSetup, build_subject_model, check_mounts
 from .sources import Source
@@ -303,9 +302,6 @@ def run_session(
     source, the mount of a sensor is not known, or the file `record` is there and `force` is not given.
     """
     try:
-        if record is not None:
-            check_absent(Path(record), force)
-        check_mounts(source, setup)
         warm_up(method)  # before samples come
         if not open_and_wait(source, outputs, until):
             return SessionSummary()

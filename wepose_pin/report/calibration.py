@@ -10,7 +10,7 @@ from ..calibration import Calibration
 from ..calibration.least_squares import MIN_CONTACT
 from ..diagnostics import lines
 from ..recording import Recording, compute_mount, find_mount_axes
-from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
+from .figures import COLOURS, ReportFigure, draw_over_time
 from .page import Banner, Item, render_page
 from .words import Table, kinds, listed, number, plain, plus_minus, spread
 
@@ -35,7 +35,7 @@ def render_calibration_report(calibration: Calibration, recording: Recording) ->
             _describe_recording(calibration, recording),
         ],
         {
-            "Lengths": [draw_lengths(calibration), _describe_lengths(calibration), tabulate_lengths(calibration)],
+            "Lengths": [_describe_lengths(calibration), tabulate_lengths(calibration)],
             "Sensors": _list_sensors(calibration),
             f"{gap} over time": [draw_gap(calibration, gap), describe_gap(calibration)] if has_gap else [],
         },
@@ -160,34 +160,7 @@ def _find_mount_stds(subject: Subject, segment: str) -> tuple[float, float]:
     return float(np.sqrt(0.5 * (x**2 + y**2))), float(z)
 
 
-# Figures --------------------------------------------------------------------------------------------------------------
-
-
-@styled
-def draw_lengths(calibration: Calibration) -> ReportFigure:
-    """Each length against the prior's, with intervals."""
-    subject, problem = calibration.subject, calibration.problem
-    names, at = list(subject.lengths), -np.arange(len(subject.lengths), dtype=float)
-    prior = np.array([problem.prior.lengths.get(name, np.nan) for name in names])
-    std, before = (1e3 * np.array([person.std(name) for name in names]) for person in (subject, problem.prior))
-    off = 1e3 * (np.array(list(subject.lengths.values())) - prior)
-    measured = 1e3 * (np.array([problem.measured.get(name, (np.nan,))[0] for name in names]) - prior)
-    figure = ReportFigure(
-        "Lengths against the prior's; bars are one, thin lines two standard deviations.", 0.28 * len(names) + 0.1
-    )
-    ax = figure.grid(left_in=1.7)[0, 0]
-    ax.barh(at, 2 * before, left=-before, height=0.62, color=BAND, label="prior, ± 1 standard deviation")
-    ax.errorbar(off, at, xerr=2 * std, fmt="none", color=COLOURS["right"], elinewidth=0.9)
-    ax.errorbar(off, at, xerr=std, fmt="o", color=COLOURS["right"], elinewidth=3, markersize=5, label="estimated")
-    if np.isfinite(measured).any():
-        ax.plot(measured, at + 0.3, "v", color="black", markerfacecolor="white", label="measured")
-    ax.axvline(0.0, color=SOFT, linewidth=0.8)
-    ax.set_yticks(at, [plain(name) for name in names])
-    ax.set_xlabel("longer than the prior [mm]")
-    ax.grid(axis="y", visible=False)
-    ax.margins(x=0.04)
-    figure.add_legend()
-    return figure
+# The figure -----------------------------------------------------------------------------------------------------------
 
 
 def draw_gap(calibration: Calibration, label: str) -> ReportFigure:

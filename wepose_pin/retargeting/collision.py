@@ -44,15 +44,15 @@ class NearPairs(NamedTuple):
 class CollisionModel:
     """The robot's shapes, each as its convex hull: fast, and the nearest points move smoothly.
 
-    Its `pairs` of hulls are those of `select_pairs`, less those that collide in almost any posture, or, few joints
-    apart on one arm, in none. Tasks leave the `clearance` (pairs,) [m]; no step and no stop goes below
+    Its `pairs` of hulls are those of `copy_checked_shapes`, less those that collide in almost any posture, or, few
+    joints apart on one arm, in none. Tasks leave the `clearance` (pairs,) [m]; no step and no stop goes below
     `least_distance`.
     """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.hulls, hull_of = _build_hulls(robot)
-        pairs = _leave_out_always_and_never(robot, select_pairs(robot))
+        pairs = _leave_out_always_and_never(robot, copy_checked_shapes(robot))
         self.pairs = sorted({tuple(sorted((hull_of[i], hull_of[j]))) for i, j in pairs})
         for i, j in self.pairs:
             self.hulls.addCollisionPair(pin.CollisionPair(i, j))
@@ -233,8 +233,8 @@ def list_corners(shape: Any) -> np.ndarray:
     return points @ shape.placement.rotation.T + shape.placement.translation
 
 
-def select_pairs(robot: Robot) -> list[tuple[int, int]]:
-    """Return the pairs of the robot's shapes that must not collide.
+def copy_checked_shapes(robot: Robot) -> Any:
+    """Return the robot's shapes with the pairs of them that must not collide.
 
     Left out are shapes of one part, pairs that the SRDF disables, adjacent links, and what collides in the rest
     posture.
@@ -262,17 +262,18 @@ def select_pairs(robot: Robot) -> list[tuple[int, int]]:
                 "give a rest above it, or another table"
             )
         if ends not in disabled and ends not in adjacent and not result.isCollision():
-            pairs.append((pair.first, pair.second))
-    return pairs
+            pairs.append(pin.CollisionPair(pair.first, pair.second))
+    shapes.removeAllCollisionPairs()
+    for pair in pairs:
+        shapes.addCollisionPair(pair)
+    return shapes
 
 
-def _leave_out_always_and_never(robot: Robot, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The pairs without those that collide in almost any posture, or, few joints apart on one arm, in none."""
+def _leave_out_always_and_never(robot: Robot, shapes: Any) -> list[tuple[int, int]]:
+    """The shapes' pairs without those that collide in almost any posture, or, few joints apart on one arm, in none."""
+    pairs = [(pair.first, pair.second) for pair in shapes.collisionPairs]
     if not pairs:
         return []
-    shapes = pin.GeometryModel(robot.geometry)
-    for i, j in pairs:
-        shapes.addCollisionPair(pin.CollisionPair(i, j))
     data, geometry = robot.model.createData(), shapes.createData()
     rng, ends, n = np.random.default_rng(0), np.array(robot.bounds), len(robot.names)
     hits, samples = np.zeros(len(pairs)), min(_SAMPLES, _MAX_TESTS // len(pairs))

@@ -21,7 +21,7 @@ from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..recording import find_runs, format_span
 from ..writers.motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
-from .collision import select_pairs
+from .collision import copy_checked_shapes
 from .maps import RobotMap
 from .robot import Robot
 from .trajectory import Trajectory
@@ -96,12 +96,9 @@ class SelfCollisions(NamedTuple):
 def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfCollisions:
     """Check every sample with the robot's own shapes, not their hulls.
 
-    The pairs are those of `select_pairs`; what the controller leaves out of them has no part in it.
+    The pairs are those of `copy_checked_shapes`; what the controller leaves out of them has no part in it.
     """
-    pairs = select_pairs(robot)
-    shapes = pin.GeometryModel(robot.geometry)
-    for i, j in pairs:
-        shapes.addCollisionPair(pin.CollisionPair(i, j))
+    shapes = copy_checked_shapes(robot)
     data, geometry = robot.model.createData(), shapes.createData()
     boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
     hits = [
@@ -110,10 +107,11 @@ def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfC
     first = ""
     if hits:
         pin.computeCollisions(robot.model, data, shapes, geometry, robot.configuration(u[hits[0]]), True)
-        pair = next(pairs[k] for k, result in enumerate(geometry.collisionResults) if result.isCollision())
-        names = " and ".join(shapes.geometryObjects[i].name for i in pair)
+        collides = [result.isCollision() for result in geometry.collisionResults]
+        pair = shapes.collisionPairs[collides.index(True)]
+        names = " and ".join(shapes.geometryObjects[i].name for i in (pair.first, pair.second))
         first = f"{names} at {float(time[hits[0]]):.2f} s"
-    return SelfCollisions(len(hits), first, len(pairs))
+    return SelfCollisions(len(hits), first, len(shapes.collisionPairs))
 
 
 def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:

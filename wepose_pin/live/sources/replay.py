@@ -15,6 +15,7 @@ from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
 from . import Source, SourceKind, SourceOptions
 
+BLOCK = 64  # samples that come together as fast as possible
 MIN_SLEEP_S = 0.0005  # up to 1 kHz every sample comes when it is due, faster ones come together
 
 
@@ -35,16 +36,16 @@ class ReplaySource(Source):
     """A recording at `speed` times its own pace.
 
     Samples in marked gaps are left out, as of a silent sensor. Samples that become due between two reads come together;
-    as fast as possible, `speed` ``math.inf``, `block` of every sensor.
+    as fast as possible, `speed` ``math.inf``, `BLOCK` of every sensor.
     """
 
-    def __init__(self, recording: Recording, speed: float = 1.0, block: int = 64) -> None:
+    def __init__(self, recording: Recording, speed: float = 1.0) -> None:
         super().__init__(recording.sensors, recording.rate_hz)
         self.recording, self.begin = recording, float(recording.time[0])
         self._numbers = {name: list_numbers(sensor) for name, sensor in recording.sensors.items()}
         # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz
-        self._speed, self._block, self._next, self._begin = speed, block, 0, 0.0
+        self._speed, self._next, self._begin = speed, 0, 0.0
 
     @property
     def orientations(self) -> dict[str, bool]:
@@ -61,7 +62,7 @@ class ReplaySource(Source):
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples that became due since the last call, one `Samples` a sensor; None after the last."""
-        first, last = self._next, self._next + self._block
+        first, last = self._next, self._next + BLOCK
         if first >= len(self._time):
             return None
         deadline = time.monotonic() + timeout_s
