@@ -25,7 +25,7 @@ APPROACH_S = 2.0
 
 
 def write_trajectory_folder(folder: Path, seed: int = 1, seconds: float = 8.0, rate_hz: float = RATE_HZ) -> Path:
-    """A folder as `wepose retarget` writes it, of the robot arm of `arms`: two phases, three repetitions."""
+    """A folder as `wepose retarget` writes it, of the robot arm of `arms`, with three phases."""
     folder.mkdir()
     write_arm(folder).rename(folder / "robot.urdf")
     (folder / "arm.toml").unlink()
@@ -46,8 +46,11 @@ def write_trajectory_folder(folder: Path, seed: int = 1, seconds: float = 8.0, r
         "posture": {},
         "root": {"x": 0.1, "y": 0.0, "z": 0.7, "qx": x, "qy": y, "qz": z, "qw": w},
         "approach_s": APPROACH_S,
-        "recorded_phases": {"reach": [[1.5, 2.5], [3.0, 4.2]], "later": [[90.0, 91.0]]},
-        "repetitions": {"source": "right_elbow_flexion", "spans": [[1.6, 2.4], [2.6, 3.4], [3.6, 4.4]]},
+        "recorded_phases": {
+            "reach": [[1.5, 2.5], [3.0, 4.2]],
+            "later": [[90.0, 91.0]],
+            "wave": [[1.6, 2.4], [2.6, 3.4], [3.6, 4.4]],
+        },
     }
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     return folder
@@ -107,10 +110,10 @@ def test_each_result_is_an_episode(trajectory: Path, tmp_path: Path) -> None:
     assert episodes["dataset_to_index"].to_list() == [400, 550]
 
 
-def test_repetitions_and_phases_are_episodes(trajectory: Path, tmp_path: Path) -> None:
+def test_intervals_of_a_phase_are_episodes(trajectory: Path, tmp_path: Path) -> None:
     """The recording's 1.5 s are at 2 s of the trajectory: the approach before belongs to no phase."""
     position = read_positions(trajectory)
-    export(trajectory, tmp_path / "r", "lerobot", episodes="repetitions", instruction="wave")
+    export(trajectory, tmp_path / "r", "lerobot", episodes="wave", instruction="wave")
     frames = read_frames(tmp_path / "r")
     assert frames["episode_index"].value_counts(sort=True)["count"].to_list() == [41, 41, 41]
     np.testing.assert_array_equal(frames["observation.state"].to_numpy()[0], position[105].astype(np.float32))
@@ -156,14 +159,6 @@ def find_lerobot() -> str:
 def change_summary(folder: Path, **values: object) -> None:
     file = folder / "summary.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | values))
-
-
-def test_why_a_recording_has_no_repetitions_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_trajectory_folder(tmp_path / "arm", seconds=3.0)
-    change_summary(folder, repetitions={"source": "", "spans": [], "reason": "its 4 excursions are not alike"})
-    said = f"{folder}: no repetitions were found in it: its 4 excursions are not alike; there is: reach"
-    words = ["-o", str(tmp_path / "data"), "--format", "lerobot", "--episodes", "repetitions"]
-    assert_refused(capsys, [str(folder), *words], said)
 
 
 def change_table(folder: Path, change: pl.Expr) -> None:

@@ -55,18 +55,14 @@ def retarget(
     """
     options = dict(locals())
     import json
-    from dataclasses import replace
 
     from .. import retargeting
-    from ..angles import joint_angles
-    from ..angles.repetitions import find_repetitions
     from ..documents import whole_folder
     from ..report import retargeting as report_room
     from ..report.page import PAGES, write_pages
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
     from ..writers import load_result, select_pose
-    from ..writers.motion import REPETITIONS
     from ..writers.result import as_json, collect_provenance
 
     names = ("robot", "arm", "task", "rate_hz", "scale", "smoothing_hz", "speed_scale", "limit_margin")
@@ -86,20 +82,9 @@ def retarget(
         collisions = retargeting.find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
         progress("writing", 0.98)
         retargeting.write_trajectory(folder, trajectory)
-        sides = tuple(arm.side for arm in trajectory.robot.arms)
-        angles = joint_angles(pose)
-        own = {joint: each for joint, each in angles.joints.items() if joint.startswith(sides)}
-        repetitions = find_repetitions(replace(angles, joints=own))
         summary = as_json(retargeting.summarize(trajectory, check, collisions))
-        summary |= {
-            "recording": name,
-            "recorded_phases": {name: list(map(list, spans)) for name, spans in tracked.phases.items()},
-            REPETITIONS: {
-                "source": repetitions.source,
-                "spans": repetitions.spans.tolist(),
-                "reason": repetitions.reason,
-            },
-        }
+        phases = {name: list(map(list, spans)) for name, spans in tracked.phases.items()}
+        summary |= {"recording": name, "recorded_phases": phases}
         text = json.dumps({**summary, "provenance": collect_provenance("retarget", options)}, indent=2)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         progress("making the pages", 0.99)

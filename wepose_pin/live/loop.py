@@ -40,7 +40,6 @@ from .ticks import Recorder, SensorMonitor, StartPoseSearch, check_units
 CONNECT_S = 0.2  # [s] for which a source searches before the user is asked again
 SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
-RATE_S = 1.0  # [s] of newest samples that are kept while tracking, to measure rates
 MAX_LATENCIES = 100_000  # newest latencies in the summary
 SHOWN_LATENCIES = 1000  # and in the status
 
@@ -194,7 +193,7 @@ class LiveLoop(Stage):
         recording = self._stream.make_recording((begin, end), last=end)
         diagnostics = check_units(recording)
         self._tracker.push(recording)
-        self._monitor.kept_s = RATE_S
+        self._monitor.keeps_samples = False
         self._diagnostics = (*self._tracker.diagnostics, *diagnostics)
         self._first_pose = self._last_pose = float(recording.time[-1])
         self.log.event("start", begin=begin, end=end)

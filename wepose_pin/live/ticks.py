@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,17 +52,26 @@ class SensorMonitor:
     def __init__(self, source: Source) -> None:
         self.wrong_unit = ""  # a sentence on sensors whose rates contradict gravity; empty: there is none
         self.sending: dict[str, float] = {}  # sensor that has sent something → time [s] of its newest sample
-        self.kept_s = WINDOW_S  # [s] of newest samples, for `collect`; of fewer seconds no wrong unit is found
+        self.keeps_samples = True  # of the last `WINDOW_S`, for `collect` and to find a wrong unit
         self._source = source
         self._arrived: dict[str, float] = {}  # sensor → time [s] of the last arrival
+        self._times: dict[str, deque[float]] = {}  # [s] of the samples of the last second
         self._recent: dict[str, list[Samples]] = {}
 
     def push(self, samples: Iterable[Samples]) -> None:
         """Take samples in their order of arrival."""
         now = self._source.clock()
         for chunk in samples:
-            if len(chunk.time) and math.isfinite(newest := float(chunk.time[-1])):
-                self._arrived[chunk.sensor], self.sending[chunk.sensor] = now, newest
+            if not (len(chunk.time) and math.isfinite(newest := float(chunk.time[-1]))):
+                continue
+            self._arrived[chunk.sensor], self.sending[chunk.sensor] = now, newest
+            times = self._times.setdefault(chunk.sensor, deque())
+            if times and abs(float(chunk.time[0]) - times[-1]) > 1.0:  # a silence, or a clock that was set
+                times.clear()
+            times.extend(chunk.time.tolist())
+            while not times[0] >= newest - 1.0:  # NaN too
+                times.popleft()
+            if self.keeps_samples:
                 self._recent.setdefault(chunk.sensor, []).append(chunk)
 
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
@@ -77,18 +87,18 @@ class SensorMonitor:
 
     def update(self, now: float) -> dict[str, float]:
         """Sensor → samples a second over the last second, on the source's clock; looks for a wrong unit as well."""
+        self.wrong_unit = self._find_wrong_unit() if self.keeps_samples else ""
         rates = {}
-        for name, recent in self._recent.items():
-            recent[:] = [self.collect(name, self.kept_s)]
-            time_s = recent[0].time[recent[0].time >= self.sending[name] - 1.0]
-            span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-            rates[name] = (len(time_s) - 1) / span_s if now - self._arrived[name] < 1.0 and span_s > 0.0 else 0.0
-        self.wrong_unit = self._find_wrong_unit()
+        for name, times in self._times.items():
+            span_s = times[-1] - times[0]
+            rates[name] = (len(times) - 1) / span_s if now - self._arrived[name] < 1.0 and span_s > 0.0 else 0.0
         return rates
 
     def _find_wrong_unit(self) -> str:
         rates = {}
-        for name, ((_, time_s, gyro_S, accel_S),) in self._recent.items():
+        for name, recent in self._recent.items():
+            recent[:] = [self.collect(name, WINDOW_S)]
+            ((_, time_s, gyro_S, accel_S),) = recent
             if len(time_s) and np.ptp(time_s) > 0.9 * WINDOW_S and name not in self._source.orientations:
                 rates[name] = find_unseen_rate(gyro_S, accel_S, (len(time_s) - 1) / float(np.ptp(time_s)))
         rates = {name: rate for name, rate in rates.items() if math.isfinite(rate)}

@@ -145,8 +145,7 @@ def export(
     phase : str, optional
         Use only this phase of the recording. If it has several intervals, NAME:2 is the second one.
     episodes : str, optional
-        Only for lerobot: make each interval of this phase of the recording an episode, or, by the word repetitions,
-        each repetition of the movement. Without it each result is an episode.
+        Only for lerobot: make each interval of this phase of the recording an episode. Without it each result is one.
     instruction : str, optional
         Only for lerobot: describe what the robot does by this text. Without it "follow" and the name of the recording.
     osim_model : str or Path, optional

@@ -22,7 +22,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption, WrongOption, native_stderr_muted, one_of
 from ..libraries import import_library
 from ..rotations import multiply
-from .motion import REPETITIONS, ROBOT_URDF, JointMotion, LinkTransform, compute_link_transforms, is_even
+from .motion import ROBOT_URDF, JointMotion, LinkTransform, compute_link_transforms, is_even
 from .result import write_table
 
 # ROS 2 ---------------------------------------------------------------------------------------------------------------
@@ -187,8 +187,8 @@ def write_lerobot(
     """Write a data set of version 3.0 into an existing folder; the action is the positions of the next frame.
 
     ``data/`` has a row a frame of all episodes one after another, ``meta/`` their beginnings, tasks and statistics.
-    `episodes`: "repetitions" of the movement, or the intervals of a phase; None: the motions. `instruction`: the task
-    of all; None: "follow NAME", and the name of the phase.
+    `episodes`: the intervals of this phase; None: the motions. `instruction`: the task of all; None: "follow NAME", and
+    the name of the phase.
     """
     rate_hz, diagnostics = _check_alike(motions), list[Diagnostic]()
     listed = [each for motion in motions for each in _list_episodes(motion, episodes, instruction, diagnostics)]
@@ -242,13 +242,10 @@ def _list_episodes(
     if by is None:
         return [(motion, motion.position[-1], text)]
     spans = motion.phases.get(by, ())
-    if by != REPETITIONS and not instruction:
-        text += f", {by}"
+    text += "" if instruction else f", {by}"
     parts = [part for span in spans if (part := motion.samples(span)).stop - part.start >= 2]
     if not parts:
         why = "the trajectory follows none of it" if spans else "it has no such phase"
-        if by == REPETITIONS and not spans:
-            why = f"no repetitions were found in it: {motion.no_repetitions}"
         known = [name for name, intervals in motion.phases.items() if intervals and name != by]
         raise WrongOption("episodes", by, f"{motion.where}: {why}; {one_of(known, by)}")
     if len(parts) < len(spans):

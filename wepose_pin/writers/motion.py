@@ -30,7 +30,6 @@ from ..tracking import TrackResult
 from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
-REPETITIONS = "repetitions"  # in the summary of a trajectory, and as the name of what makes episodes
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
 SLACK_S = 1e-6  # [s] by which times that are written with digits differ
@@ -130,10 +129,9 @@ class JointMotion:
     posture: Mapping[str, float] = field(default_factory=dict)  # joint that stays → its value; zero where not named
     p_WB: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [m] of the root link in W
     quat_WB: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))  # xyzw of the root link in W
-    phases: Mapping[str, Intervals] = field(default_factory=dict)  # `REPETITIONS` are those of the movement
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # [s] of the recording
     begin: int = 0  # the first sample after the robot's approach
     source: str = ""  # name of the recording that a robot follows
-    no_repetitions: str = ""  # why none were found in it
 
     @property
     def rate_hz(self) -> float:
@@ -181,8 +179,7 @@ class JointMotion:
 
     def select(self, interval: tuple[float, float] | None, phase: str | None) -> JointMotion:
         """Return the part that follows an interval [s] or a phase of the recording; both None: all of it."""
-        phases = {name: spans for name, spans in self.phases.items() if name != REPETITIONS}
-        selected = select_interval(self.recorded_time, phases, interval, phase)
+        selected = select_interval(self.recorded_time, self.phases, interval, phase)
         part = self if selected is None else self.cut(self.samples(selected))
         if selected is not None and len(part.time) < 2:
             raise BadData(f"{self.where}: follows no {selected[0]:g} to {selected[1]:g} s of the recording")
@@ -248,10 +245,8 @@ def read_joint_motion(folder: Path) -> JointMotion:
         raise MissingFile(f"{folder}: no {lost[0]} in it; a folder that `wepose retarget` wrote is needed here")
     with library_errors(summary_file, "the summary of a trajectory"):
         summary = json.loads(summary_file.read_text(encoding="utf-8"))
-        joints, repetitions = tuple(map(str, summary["joints"])), summary.get(REPETITIONS) or {}
+        joints, approach_s = tuple(map(str, summary["joints"])), float(summary["approach_s"])
         place = np.array([float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")])
-        approach_s, spans = float(summary["approach_s"]), repetitions.get("spans", ())
-        phases = read_phases(summary) | {REPETITIONS: tuple((float(begin), float(end)) for begin, end in spans)}
         posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
         named = {"name": str(summary["robot"]), "source": str(summary["recording"])}
     columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
@@ -271,9 +266,8 @@ def read_joint_motion(folder: Path) -> JointMotion:
         posture=posture,
         p_WB=place[:3],
         quat_WB=place[3:] / np.linalg.norm(place[3:]),
-        phases=phases,
+        phases=read_phases(summary),
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
-        no_repetitions=str(repetitions.get("reason") or ""),
         **named,
     )
 
