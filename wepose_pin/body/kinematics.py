@@ -394,17 +394,16 @@ def compute_point_covariances(
             continue
         # Sample by sample: the bits of one large product would depend on the number of samples.
         cov = J @ shape_cov[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
+        skews: dict[str, np.ndarray] = {}  # segment → [v]×
         for segment, vector in vectors.items():
-            skew = np.zeros((n, 3, 3))  # [v]×
+            skew = np.zeros((n, 3, 3))
             skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
-            skew = skew - skew.swapaxes(1, 2)
+            skews[segment] = skew = skew - skew.swapaxes(1, 2)
             cov += skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
-        for (near, far), shared in heading_cov.items():
-            if near in vectors and far in vectors:
-                # A heading error ε moves the end of a vector by ε e_z × v.
-                a, b = (np.stack([-vectors[name][:, 1], vectors[name][:, 0]], axis=1) for name in (near, far))
-                outer = shared[:, None, None] * a[:, :, None] * b[:, None, :]
-                cov[:, :2, :2] += outer + outer.swapaxes(1, 2)
+        for (near, far), shared in heading_cov.items():  # of errors about z
+            if near in skews and far in skews:
+                outer = shared[:, None, None] * skews[near][:, :, 2, None] * skews[far][:, None, :, 2]
+                cov += outer + outer.swapaxes(1, 2)
         covariances[point] = cov + off_law
     return covariances
 

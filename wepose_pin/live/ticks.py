@@ -161,8 +161,8 @@ class Recorder:
                 self.log.flush_if_due()
 
     def _begin_ticks(self) -> None:
-        which, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
-        times = [time_s[which == i] for i in np.unique(which)]
+        which, rows = map(np.concatenate, zip(*self._waiting, strict=True))
+        times = [rows[which == i, 0] for i in np.unique(which)]
         if len(times) < len(self.sensors):
             return
         first, newest = max(float(own[0]) for own in times), max(float(own[-1]) for own in times)

@@ -184,8 +184,8 @@ def _read_content(path: Path) -> tuple[dict[str, Any], Arrivals, list[dict[str, 
                     samples.extend((header["sensors"].index(topic.removeprefix(SENSORS)), message["t"]))
                     packed = [*message["orientation"], 0.0, 0.0] if "orientation" in message else None
                     samples.extend(packed or [*message["gyro"], *message["accel"]])
-    which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
-    arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
+    numbers = np.array(samples).reshape(-1, 8)
+    arrivals = Arrivals(numbers[:, 0].astype(np.uint8), numbers[:, 1:].copy())
     rows = np.array(poses).reshape(-1, 1 + 4 * len(header.get("sensors", ())))
     return header, arrivals, events, rows, isinstance(record, Footer)
 

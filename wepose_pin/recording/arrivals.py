@@ -84,9 +84,7 @@ class Arrivals(NamedTuple):
     """Samples of all sensors in their order of arrival."""
 
     which: np.ndarray  # (m,) uint8, index of the sensor
-    time: np.ndarray  # (m,) [s]
-    gyro_S: np.ndarray  # (m, 3) [rad/s]
-    accel_S: np.ndarray  # (m, 3) [m/s²]
+    rows: np.ndarray  # (m, 7) time [s], gyro, accel: rows of its buffer
 
 
 def pack_orientations(quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,9 +108,10 @@ def order_arrivals(samples: Sequence[Samples], sensors: Sequence[str]) -> Arriva
     """Merge the samples of one read in order of time; the order in which sensors were read has no meaning."""
     sensor = np.array([sensors.index(s.sensor) for s in samples], dtype=np.uint8)
     which = sensor.repeat([len(s.time) for s in samples])
-    time, gyro_S, accel_S = (np.concatenate(column, dtype=float) for column in tuple(zip(*samples, strict=True))[1:])
-    order = np.argsort(time, kind="stable") if len(samples) > 1 else slice(None)
-    return Arrivals(which[order], time[order], gyro_S[order], accel_S[order])
+    _, *columns = zip(*samples, strict=True)
+    rows = np.column_stack([np.concatenate(column, dtype=float) for column in columns])
+    order = np.argsort(rows[:, 0], kind="stable") if len(samples) > 1 else slice(None)
+    return Arrivals(which[order], rows[order])
 
 
 class Ticks(NamedTuple):
@@ -170,13 +169,10 @@ class StreamSynchronizer:
 
     def push(self, arrivals: Arrivals) -> Iterator[Ticks]:
         """Take samples and iterate over the ticks that they complete, some at a time: after a silence they are many."""
-        samples = np.column_stack([arrivals.time, arrivals.gyro_S, arrivals.accel_S])
-        next_sample, count = 0, _OUT
-        while next_sample < len(samples) or count == _OUT:
+        next_sample, count, state = 0, _OUT, (self._clock, self._sensors, self._buffers)
+        while next_sample < len(arrivals.rows) or count == _OUT:
             first = self.next_tick
-            next_sample, count = _take_samples(
-                self._clock, self._sensors, self._buffers, arrivals.which, samples, next_sample, *self._out
-            )
+            next_sample, count = _take_samples(*state, *arrivals, next_sample, *self._out)
             if count:
                 values, lost = (each[:count].copy() for each in self._out)
                 time = self.begin + np.arange(first, first + count) / self.rate_hz

@@ -58,9 +58,10 @@ class LiveLog:
 
     def samples(self, came: Arrivals) -> None:
         """What arrived, in the order of arrival."""
-        rows = zip(*(column.tolist() for column in came), strict=True) if self._file is not None else ()
-        for sensor, time_s, gyro, accel in rows:
-            signals = {"orientation": [*gyro, accel[0]]} if self._measured[sensor] else {"gyro": gyro, "accel": accel}
+        rows = zip(came.which.tolist(), came.rows.tolist(), strict=True) if self._file is not None else ()
+        for sensor, (time_s, *values) in rows:
+            is_orientation, gyro, accel = self._measured[sensor], values[:3], values[3:]
+            signals = {"orientation": values[:4]} if is_orientation else {"gyro": gyro, "accel": accel}
             if math.isfinite(time_s):
                 self._time_ns = int(1e9 * min(max(time_s, 0.0), LATEST_S))
             self._put(self._channels[sensor], {"t": time_s, **signals})
