@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import (
     MTI_3,
@@ -111,9 +112,10 @@ def measure_case(case: Case, seeds: range) -> dict[str, float]:
         recording = simulation.recording()
         recording = replace(recording, phases={"start": recording.phases["start"]})
         body = ACTIVITIES[case.activity].body if case.activity in ACTIVITIES else None
+        truth = simulation.truth()
         for way in WAYS:
             tracked = track(recording, model=body, open_loop=way == "open", causal=way == "causal")
-            errors, stds = find_heading_errors(simulation, tracked)
+            errors, stds = find_heading_errors(truth, tracked)
             figures.setdefault(way, []).append(float(np.degrees(rms(errors))))
             figures.setdefault(f"{way}_by_std", []).append(rms(errors / stds))
     return {name: rms(np.array(values)) for name, values in figures.items()}
@@ -135,15 +137,18 @@ def simulate_case(case: Case, seed: int) -> Simulation:
     )
 
 
-def find_heading_errors(simulation: Simulation, tracked: TrackResult) -> tuple[np.ndarray, np.ndarray]:
-    """Find the errors of all segments' headings over time and their stated standard deviations, both (m,) [rad]."""
+def find_heading_errors(truth: Pose, tracked: TrackResult) -> tuple[np.ndarray, np.ndarray]:
+    """Find the errors of all segments' headings over time and their stated standard deviations, both (m,) [rad].
+
+    Both poses are in the W whose x is where the torso faces in the start pose.
+    """
     time = tracked.time
     step = max(1, round(EVERY_S * tracked.recording.rate_hz))
     rows = np.flatnonzero(time > SCORED_FROM_S)[::step]
-    at = np.searchsorted(simulation.time, time[rows] - 1e-9)
+    at = np.searchsorted(truth.time, time[rows] - 1e-9)
     errors, stds = [], []
     for name, quat_WL in tracked.quat_WL.items():
-        error = Rotation.from_quat(simulation.quat_WL[name][at]) * Rotation.from_quat(quat_WL[rows]).inv()
+        error = Rotation.from_quat(truth.quat_WL[name][at]) * Rotation.from_quat(quat_WL[rows]).inv()
         errors.append(heading(error.as_quat()))
         stds.append(np.sqrt(tracked.pose.segment_cov[name][rows, 2, 2]))
     return np.concatenate(errors), np.concatenate(stds)
