@@ -148,13 +148,6 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 
-def turned(quat: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
-    """``quat ⊗ exp(rotvec)`` of one quaternion (4,) xyzw and one rotation vector (3,) [rad]."""
-    result = quat.copy()
-    rotate_by_vector(result, *rotvec)
-    return result
-
-
 @inlined
 def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     """In place: ``quat ← exp([x, y, z]) ⊗ quat``, renormalised as there; the vector is in W [rad]."""

@@ -99,7 +99,7 @@ class SensorFilters:
         static_test: StaticTest | None = None,
         start: slice | None = None,
     ) -> None:
-        self._filter, self._params, self._start = METHODS[check_method(method)], params, start
+        self._filter, self._params, self._start = METHODS[method], params, start
         self._is_offline, self._test = method in OFFLINE, static_test or USUAL_TEST
         if self._filter is PUBLISHED_SMEKF:
             self._test = replace(self._test, rate_stds=np.inf)
@@ -173,7 +173,7 @@ class SensorFilters:
         if first > 0:  # rates and bias change their sign backward in time; specific forces do not
             backward = METHODS[BEST] if self._is_offline else filter_
             mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
-            start = rotations.turned(quat_VS, _find_turn(gyro_S[first] - noise.gyro_bias, rate_hz))
+            start = _rotate(quat_VS, gyro_S[first] - noise.gyro_bias, rate_hz)
             static = tuple(record.copy() for record in static_records)
             static[0]["bias"] *= -1.0
             records = static, backward.make_records(mirrored, rate_hz, start, params)
@@ -186,15 +186,15 @@ class SensorFilters:
             if out.about_vertical is not None:  # what the backward run has corrected is none of the forward run
                 out.about_vertical[:first] = 0.0
             if self._is_offline:  # forward over all samples, which it alone uses, from the end of that run
-                quat_VS = rotations.turned(run.quat_VS[-1], -_find_turn(gyro_S[0] + run.gyro_bias[-1], rate_hz))
+                quat_VS = _rotate(run.quat_VS[-1], -gyro_S[0] - run.gyro_bias[-1], rate_hz)
                 params = params if self._params else replace(params, tilt_std=MOVING_TILT_STD)
         self._records[name] = static_records, filter_.make_records(noise, rate_hz, quat_VS, params)
         return first
 
 
-def _find_turn(rate: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Return the rotation [rad] over a sample; of lost ones zero."""
-    return np.where(np.isfinite(rate), rate, 0.0) / rate_hz
+def _rotate(quat_VS: np.ndarray, rate: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return the orientation (4,) after a sample of a rate (3,) [rad/s]; a lost one rotates nothing."""
+    return rotations.multiply(quat_VS, rotations.exp(np.where(np.isfinite(rate), rate, 0.0) / rate_hz))
 
 
 def collect_orientations(recording: Recording, filtered: Mapping[str, Orientation]) -> dict[str, Rotation]:

@@ -318,11 +318,8 @@ def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out
             out_bias[k, i], out_vertical[k, i] = state.gyro_bias[i], state.about_vertical[i]
 
 
-def make_records(
-    noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: AmekfParams | None
-) -> tuple[np.ndarray, np.ndarray]:
+def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: AmekfParams) -> tuple[np.ndarray, ...]:
     """Return the state and the constants of an aMEKF."""
-    p = params or AmekfParams()
     x, std, P = np.zeros(STATES), np.zeros(STATES), np.zeros((STATES, COLUMNS))
     x[ERROR.gyro_bias] = noise.gyro_bias
     std[ERROR.attitude] = p.tilt_std, p.tilt_std, base.START_HEADING_STD

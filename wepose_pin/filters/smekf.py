@@ -158,10 +158,7 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         P[0, i], P[1, i], P[2, i] = A[i], C[i], B[i]
 
 
-def _make_records(
-    noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: SmekfParams | None
-) -> tuple[np.ndarray, ...]:
-    p = params or SmekfParams()
+def _make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: SmekfParams) -> tuple[np.ndarray, ...]:
     P = np.zeros((3, 9))
     P[0, [0, 4, 8]] = np.square([p.tilt_std, p.tilt_std, base.START_HEADING_STD])
     P[2] = noise.gyro_bias_cov.ravel()
