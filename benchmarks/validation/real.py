@@ -271,14 +271,16 @@ def assume_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> SensorN
     bias of 0.2 deg/s for its standard deviation (that of RING's sensors is 0.2 to 0.9 deg/s in all).
     """
     gyro = MTI_3.gyro_density**2 * rate_hz * np.eye(3)
+    accel_var = (MTI_3.accel_density / GRAVITY) ** 2 * rate_hz
     known = gyro_bias is not None
     return SensorNoise(
         gyro_bias=np.array(gyro_bias) if known else np.zeros(3),
         gyro_bias_cov=(BIAS_STD if known else MTI_3.gyro_bias_std) ** 2 * np.eye(3),
         gyro_cov=gyro,
-        accel_cov=(MTI_3.accel_density / GRAVITY) ** 2 * rate_hz * np.eye(3),
+        accel_cov=accel_var * np.eye(3),
         bias_step_cov=2.0 * gyro,
         gravity=GRAVITY,
+        accel_step_var=2.0 * accel_var,
     )
 
 

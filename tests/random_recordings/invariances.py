@@ -122,6 +122,10 @@ def _find_difference(base: tuple[Result, float], other: tuple[Result, float], of
         degrees, z = float(np.degrees(angle[k])), 0.0
         if std is not None and of.most_deg is None:
             ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows], 1e-9))
+            if of.variant.finer > 1:
+                # When a motion ends is known to a sample of the coarser recording: what a filter corrects there, the
+                # other rate may correct within that sample, and what both agree on at the next one is no difference.
+                ratio = np.minimum(ratio[1:], ratio[:-1])
             z = float(ratio.max())
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
         if most is not None and std is None:

@@ -46,6 +46,7 @@ class SensorNoise:
     accel_cov: np.ndarray  # (3, 3) Σ̂_g, sample covariance of accel/gravity [1]
     bias_step_cov: np.ndarray  # (3, 3) [rad²/s²] Σ_b, that of gyro's first differences, as in the authors' software
     gravity: float  # mean norm of accel [m/s²]: the gravity scale
+    accel_step_var: float  # [1] variance of the first differences of accel/gravity, the mean over its axes
     # (3, 3) covariance of gyro's means over `BLOCK_S` [rad²/s²], with sway; zero: white noise
     gyro_half_second_cov: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
@@ -69,6 +70,7 @@ TYPICAL = SensorNoise(
     accel_cov=0.003**2 * np.eye(3),
     bias_step_cov=2.0 * np.deg2rad(0.1) ** 2 * np.eye(3),
     gravity=STANDARD_GRAVITY,
+    accel_step_var=2.0 * 0.003**2,
 )
 
 
@@ -100,6 +102,7 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
         accel_cov=_apply_floor(_compute_cov(accel_S / gravity), ACCEL_FLOOR),
         bias_step_cov=_apply_floor(_compute_cov(gyro_S[1:] - gyro_S[:-1]), GYRO_FLOOR),
         gravity=gravity,
+        accel_step_var=float(np.diff(accel_S / gravity, axis=0).var(axis=0).mean()),
         gyro_half_second_cov=half_second_cov,
     )
 

@@ -6,9 +6,10 @@ chair's rate for it. Condition (5), ours, compares the mean rate about the verti
 start phase, then of each accepted static phase. Rotation about horizontal axes turns gravity in S, which (2) detects.
 
 (1) to (4) compare samples with the noise of samples, which grows with the rate of sampling. At 1 kHz the start of a
-smooth motion hides in it for 0.13 s in the paper's dynamic experiment, and a filter takes that motion for bias.
-Condition (6), ours, compares the mean gyro of the window's newest part with that of the window. The noise of these
-means does not depend on the rate of sampling.
+smooth motion hides in it for 0.13 s in the paper's dynamic experiment, and a filter takes that motion for bias. At
+25 Hz the covariance of a window's dozen samples scatters beyond the limit. So (1) and (2), but for the published
+method, allow the slow motion that they would allow at `WHITE_RATE_HZ`, whatever the rate. Condition (6), ours, compares
+the mean gyro of the window's newest part with that of the window. The noise of these means does not depend on the rate.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ..compilation import inlined, kernel
 from .base import FilterParams, make_record
 from .phases import BLOCK_S, SensorNoise
 
+WHITE_RATE_HZ = 200.0  # of (1) and (2), where 0.5 s are 100 samples, the longest window of the authors' software
 NEWEST_S = 0.05  # [s] of condition (6), about as long as the fastest smooth motion takes to begin
 # Of condition (5): about two periods of a standing person's sway, which cancels in the average; one standard deviation
 # by which the bias depends on how the sensor lies, twice what BROAD's sensors show at rest; drift of the bias, of which
@@ -43,8 +45,9 @@ class StaticTest(FilterParams):
     """When a sensor counts as static: where all six conditions hold for the window that ends with the sample.
 
     Conditions (1) to (4) and their limits are those of Lisini Baldi et al. 2019, who do not state a window. (5) and (6)
-    are additions of this package; ``rate_stds=inf`` leaves them out, as the method "smekf_published" does. "Static
-    phase" is that of the recording, in which noise and bias were measured.
+    are additions of this package, and so is that (1) and (2) allow the same slow motion at any rate of sampling;
+    ``rate_stds=inf`` leaves all three out, as the method "smekf_published" does. "Static phase" is that of the
+    recording, in which noise and bias were measured.
 
     Parameters
     ----------
@@ -85,10 +88,17 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
     if newest < n and 0.0 < squared_bound < np.inf:
         change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
         rate_change = np.linalg.inv(change_cov) / squared_bound
+    # Beyond white noise (1) and (2) allow what they would with that of `WHITE_RATE_HZ`, and twice its own scatter
+    white_share = max(WHITE_RATE_HZ / rate_hz, 4.0 * np.sqrt(3.0 / n)) if np.isfinite(test.rate_stds) else 1.0
+    more_white = (white_share - 1.0) * np.eye(3)[_UPPER]
+    limits = [
+        test.alpha * noise.gyro_cov[_UPPER] + (test.alpha - 1.0) * np.trace(noise.bias_step_cov) / 6.0 * more_white,
+        test.beta * noise.accel_cov[_UPPER] + (test.beta - 1.0) * noise.accel_step_var / 2.0 * more_white,
+    ]
     model = make_record(
         inverse_gravity=1.0 / noise.gravity,  # [s²/m]
         # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
-        limits=(n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
+        limits=(n - 1) * np.array(limits),
         norm_variance=(n - 1) * test.gamma2,
         norm_error=test.gamma1,
         newest=np.int64(min(newest, n)),  # (6): samples of the newest part
