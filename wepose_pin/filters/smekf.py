@@ -200,17 +200,17 @@ START_VAR = 1e-3  # [rad²], [rad²/s²] P₀ of the authors' software
 def _run_published(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
     quat, bias, P, vertical = states[0].quat_VS, states[0].gyro_bias, states[0].P, states[0].about_vertical
     dt, Q, R, identity = models[0].dt, models[0].Q, models[0].R, np.eye(6)
-    F, H = np.eye(6), np.zeros((6, 6))
-    F[:3, 3:], H[3:, 3:] = -dt * identity[:3, :3], identity[:3, :3]
+    axes, F, H = np.eye(3), np.eye(6), np.zeros((6, 6))
+    F[:3, 3:], H[3:, 3:] = -dt * axes, axes
     for k in range(len(gyro_S)):
         w, accel = gyro_S[k] - bias, accel_S[k] / models[0].gravity
         if np.sum(gyro_S[k] ** 2) < HIGHEST_RATE_SQUARED:  # false for NaN
             rotate_by_vector(quat, w[0] * dt, w[1] * dt, w[2] * dt)
-            _fill_cross(F, -dt * w, 1.0)  # I − [ω δt]×
+            F[:3, :3] = axes - np.cross(axes, dt * w)  # I − [ω δt]×
             P[:] = F @ P @ F.T + dt * dt * Q
             up = np.array(up_in_sensor(quat))
             if static[k] and np.sum(accel**2) < np.inf:
-                _fill_cross(H, up, 0.0)
+                H[:3, :3] = np.cross(axes, up)  # [up]×
                 K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
                 x = K @ np.concatenate((accel - up, w))
                 P[:] = (identity - K @ H) @ P
@@ -220,14 +220,6 @@ def _run_published(states, models, gyro_S, accel_S, static, out_quat, out_bias, 
                 vertical[base.RATE] += np.dot(up, x[3:])
             vertical[base.RATE_VAR] = np.dot(up, np.ascontiguousarray(P[3:, 3:]) @ up)
         out_quat[k], out_bias[k], out_cov[k], out_vertical[k] = quat, bias, P[:3, :3], vertical
-
-
-@compiled
-def _fill_cross(A, v, diagonal):  # type: ignore[no-untyped-def]
-    """Fill the upper left block of `A` with [v]× + diagonal I."""
-    A[0, 0] = A[1, 1] = A[2, 2] = diagonal
-    A[0, 1], A[0, 2], A[1, 0] = -v[2], v[1], v[2]
-    A[1, 2], A[2, 0], A[2, 1] = -v[0], -v[1], v[0]
 
 
 def _make_published_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, _: None) -> tuple[np.ndarray, ...]:
