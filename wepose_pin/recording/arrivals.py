@@ -257,7 +257,7 @@ def _watch_values(clock, sensors, sensor, sample):  # type: ignore[no-untyped-de
 def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-def]
     """Insert a sample into its sensor's buffer, in order of time."""
     dt, t = clock.dt, sample[0]
-    i = _find_sample(buffer, sensor.buffered, t - SAME * dt)
+    i = np.searchsorted(buffer[: sensor.buffered, 0], t - SAME * dt)
     if i < sensor.buffered and buffer[i, 0] < t + SAME * dt:
         sensor.counts[DUPLICATE] += 1
         return
@@ -270,10 +270,9 @@ def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-de
     if sensor.buffered == len(buffer):  # it is ahead by a full buffer and no tick is complete: drop the oldest sample
         _drop_samples(sensor, buffer, 1)
         i = max(i - 1, 0)
-    for j in range(sensor.buffered, i, -1):
-        buffer[j] = buffer[j - 1]
-    buffer[i] = sample
     sensor.buffered += 1
+    buffer[i + 1 : sensor.buffered] = buffer[i : sensor.buffered - 1].copy()
+    buffer[i] = sample
     sensor.lost = False
     sensor.counts[TAKEN] += 1
     clock.newest = max(clock.newest, t)
@@ -285,14 +284,6 @@ def _drop_samples(sensor, buffer, count):  # type: ignore[no-untyped-def]
     for j in range(sensor.buffered - count):
         buffer[j] = buffer[j + count]
     sensor.buffered -= count
-
-
-@compiled
-def _find_sample(buffer, n, t):  # type: ignore[no-untyped-def]
-    """Find the first of the `n` samples at or after `t`; n: there is none."""
-    while n > 0 and buffer[n - 1, 0] >= t:
-        n -= 1
-    return n
 
 
 @compiled
@@ -308,12 +299,12 @@ def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-unty
         if n == 0 or buffer[n - 1, 0] < t - SAME * dt:
             return False
         if buffer[n - 1, 0] < t + REORDER_S:
-            i = _find_sample(buffer, n, t - SAME * dt)
+            i = np.searchsorted(buffer[:n, 0], t - SAME * dt)
             if i > 0 and buffer[i, 0] - buffer[i - 1, 0] > HOLE * dt and buffer[i - 1, 0] > t - WAIT_S:
                 return False  # a sample in the gap may still arrive
     for s in range(len(sensors)):
         sensor, buffer, n, level = sensors[s], buffers[s], sensors[s].buffered, sensors[s].saturation.level
-        i = _find_sample(buffer, n, t - SAME * dt)
+        i = np.searchsorted(buffer[:n, 0], t - SAME * dt)
         sensor.lost = sensor.lost or i == n
         if not _write_value(buffer, n, i, t, dt, sensor.is_orientation, out[s]):
             sensor.counts[MISSING] += 1
