@@ -90,8 +90,9 @@ def test_pages_of_an_earlier_result_do_not_outlive_it(session: Path, tmp_path: P
         (tmp_path / name).write_text("of another motion", encoding="utf-8")
     track(session, tmp_path)
     assert not [name for name in contents(tmp_path) if name.endswith(".html")]
+    (tmp_path / "view.html").mkdir()  # it is no page
     track_session(session, out=tmp_path, view=False, force=True)
-    assert not (tmp_path / "view.html").exists()
+    assert (tmp_path / "view.html").is_dir()
     assert "<b>Good for</b> elbow flexion" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0
     assert np.isfinite(pl.read_parquet(tmp_path / "pose.parquet")["torso_qw"].to_numpy()).all()

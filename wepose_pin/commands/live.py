@@ -106,12 +106,12 @@ def live(
     """
     from ..live import find_setup, open_source, run_session
     from ..live.guide import GuideOptions, choose_protocol
+    from ..live.log import check_absent
     from ..live.outputs import RobotOutput, read_robot
     from ..live.setup import AssignedSource, build_subject_model, check_mounts, read_segments
     from ..live.steps import run_guide
     from ..live.terminal import Keyboard, TerminalView
     from ..retargeting.targets import check_person_arms
-    from ..writers.live_log import check_absent
 
     for option, value in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if value is not None and not guide:

@@ -19,7 +19,7 @@ from ..recording import Intervals, Recording
 from ..recording.arrivals import Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
 from ..recording.plausibility import check_signals, find_unseen_rate
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
-from ..writers.live_log import LiveLog
+from .log import LiveLog
 from .setup import SensorSetup
 from .sources import MAX_VALUES, Source
 from .state import join_names

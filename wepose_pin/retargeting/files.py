@@ -281,16 +281,12 @@ def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
 
 
 def _format_joint_trajectory(trajectory: Trajectory) -> str:
-    """ROS 2's trajectory_msgs/msg/JointTrajectory, a line a point."""
+    """ROS 2's trajectory_msgs/msg/JointTrajectory."""
     states = trajectory.joint_position, trajectory.joint_velocity, trajectory.joint_acceleration
     points = []
     for time, *state in zip(trajectory.time.tolist(), *(np.round(x, DIGITS).tolist() for x in states), strict=True):
         moment = dict(zip(("sec", "nanosec"), divmod(round(1e9 * time), 10**9), strict=True))
         point = dict(zip(("positions", "velocities", "accelerations"), state, strict=True))
-        points.append(json.dumps(point | {"effort": [], "time_from_start": moment}))
-    head = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    lines = ",\n".join(points)
-    return (
-        f'{{"header": {json.dumps(head)},\n"joint_names": {json.dumps(list(trajectory.robot.names))},\n'
-        f'"points": [\n{lines}\n]}}\n'
-    )
+        points.append(point | {"effort": [], "time_from_start": moment})
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    return json.dumps({"header": header, "joint_names": list(trajectory.robot.names), "points": points}) + "\n"
