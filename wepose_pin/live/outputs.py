@@ -26,10 +26,11 @@ from ..retargeting import Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
 from ..retargeting.stream import ArmObserver, Command, CommandStream
 from ..retargeting.targets import check_person_arms
+from ..writers.result import as_json
 from .loop import MAX_LATENCIES
 from .sources.lsl import configure_pylsl
 from .sources.udp import parse_address
-from .state import LivePose, Output, Status, StreamInfo, round_finite
+from .state import LivePose, Output, Status, StreamInfo
 
 FORMAT = 1  # of poses and of commands
 PORT = 9001  # in examples
@@ -334,9 +335,9 @@ def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:
     """One command as a line of JSON; null for what is not known."""
     arms = {
         arm.side: {
-            "error_mm": round_finite(1e3 * command.error[i, 0], 2),
-            "error_deg": round_finite(math.degrees(command.error[i, 1]), 2),
-            "std_mm": round_finite(1e3 * command.std[i], 2),
+            "error_mm": as_json(1e3 * command.error[i, 0], 2),
+            "error_deg": as_json(math.degrees(command.error[i, 1]), 2),
+            "std_mm": as_json(1e3 * command.std[i], 2),
         }
         for i, arm in enumerate(robot.arms)
     }
@@ -344,7 +345,7 @@ def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:
         "format": FORMAT,
         "n": command.number,
         "clock": round(command.clock, COMMAND_DIGITS),
-        "t": round_finite(command.time * speed, 6),
+        "t": as_json(command.time * speed, 6),
         "robot": robot.map.name,
         "state": command.state,
         "reason": command.reason,

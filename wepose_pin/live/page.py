@@ -21,7 +21,7 @@ import secrets
 import socket
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +38,9 @@ from ..errors import BadOption
 from ..report.viewer import choose_trail_colour, fill_page, find_floor, scene, view
 from ..retargeting.targets import find_person_arm
 from ..retargeting.visuals import MeshPart, build_parts, place_beside_person
+from ..writers.result import as_json
 from .sources.udp import LOOPBACK, name_host
-from .state import LONGEST_TEXT, QUIT, LivePose, Output, Request, Status, StreamInfo, round_finite
+from .state import LONGEST_TEXT, QUIT, LivePose, Output, Request, Status, StreamInfo
 
 if TYPE_CHECKING:
     from .outputs import RobotOutput
@@ -138,7 +139,7 @@ class LivePage(Output):
         server.stop()
         for client in list(self.clients):
             if self.newest_status is not None:
-                client.send(json.dumps(_to_json(self.newest_status), allow_nan=False))
+                client.send(json.dumps(as_json(self.newest_status, DIGITS), allow_nan=False))
             client.close(1001, "ended")
         for _ in range(int(GOODBYE_S / 0.01)):
             if self.clients:
@@ -156,7 +157,7 @@ class LivePage(Output):
                 continue
             if status is not None and client.status is not status:
                 client.status = status
-                client.send(json.dumps(_to_json(status), allow_nan=False))
+                client.send(json.dumps(as_json(status, DIGITS), allow_nan=False))
             if client.drawn is not drawn:
                 client.drawn = drawn
                 frame = frame or encoder.encode(pose)
@@ -327,15 +328,3 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str) -> str:
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }
     return fill_page("live/templates/live.html.j2", content, title or "wepose live")
-
-
-def _to_json(value: Any) -> Any:
-    """What JSON holds of a value; named tuples as objects, null for a number that is not known."""
-    if isinstance(value, float):
-        return round_finite(value, DIGITS)
-    if isinstance(value, Mapping):
-        return {key: _to_json(item) for key, item in value.items()}
-    if isinstance(value, tuple):
-        items = [_to_json(item) for item in value]
-        return dict(zip(value._fields, items, strict=True)) if hasattr(value, "_fields") else items
-    return value

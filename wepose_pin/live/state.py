@@ -188,11 +188,6 @@ class Stage(ABC):
             output.status(status)
 
 
-def round_finite(value: float, digits: int) -> float | None:
-    """A number for JSON; None for NaN and infinity."""
-    return round(float(value), digits) if math.isfinite(value) else None
-
-
 def join_names(segments: list[str]) -> str:
     """Segments as words: "torso, left upper arm"."""
     return ", ".join(segment.replace("_", " ") for segment in segments)

@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import io
 import json
+import math
 import platform
 import re
 import shutil
@@ -106,41 +107,37 @@ def _document(calibration: Calibration) -> dict[str, Any]:
         "diagnostics": [diagnostic_as_json(diagnostic) for diagnostic in quality.diagnostics],
         "checks": [
             {"code": check.diagnostic.code, "place": check.diagnostic.place, "quality": check.quality}
-            | {"value": _number(check.value), "passes": check.passes, "poor": check.poor}
+            | {"value": check.value, "passes": check.passes, "poor": check.poor}
             for check in quality.checks
         ],
         "protocol": calibration.problem.protocol.name,
         "measured": {name: metres for name, (metres, _) in calibration.problem.measured.items()},
-        "scale_std": _number(calibration.scale_std),
-        "lengths": {n: {"value": v, "std": _number(subject.std(n))} for n, v in subject.lengths.items()},
+        "scale_std": calibration.scale_std,
+        "lengths": {n: {"value": v, "std": subject.std(n)} for n, v in subject.lengths.items()},
         "mounts": {
             segment: {
                 **{key: float(v) for key, v in zip(("qx", "qy", "qz", "qw"), quat, strict=True)},
-                "std_deg": [_number(np.degrees(subject.std(f"mounts.{segment}.{axis}"))) for axis in "xyz"],
+                "std_deg": [np.degrees(subject.std(f"mounts.{segment}.{axis}")) for axis in "xyz"],
             }
             for segment, quat in subject.mounts.items()
         },
         "start_pose_offset_deg": {name: np.degrees(offset[:2]) for name, offset in subject.start_pose_offset.items()},
         "heading_drift_deg_min": {name: 60.0 * np.degrees(drift[0]) for name, drift in subject.heading_drift.items()},
         "hinges": {
-            joint: {"axis": subject.hinges[joint].axis, "rms_deg": _number(np.degrees(rms))}
+            joint: {"axis": subject.hinges[joint].axis, "rms_deg": np.degrees(rms)}
             for joint, rms in calibration.hinge_rms.items()
         },
-        "gap_rms": {"after": _number(calibration.rms_gap), "before": _number(calibration.prior_rms_gap)},
+        "gap_rms": {"after": calibration.rms_gap, "before": calibration.prior_rms_gap},
         "gap": {
             "time": calibration.time[some].round(3),
-            "after": [_number(v) for v in calibration.gap[some]],
-            "before": [_number(v) for v in calibration.prior_gap[some]],
+            "after": calibration.gap[some],
+            "before": calibration.prior_gap[some],
             "contact": calibration.contact[some].round(3),
         },
         "open_intervals": calibration.open_intervals,
         "effective_sample_size": calibration.effective_sample_size,
         "moved": dict(calibration.exchanged),
     }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = False) -> None:
@@ -287,15 +284,16 @@ def versions() -> dict[str, str]:
     return {"wepose-pin": __version__, "python": platform.python_version(), **packages}
 
 
-def as_json(value: Any) -> Any:
-    """Named tuples and arrays as JSON values."""
+def as_json(value: Any, digits: int | None = None) -> Any:
+    """Named tuples and arrays as JSON values, with floats of so many decimals; null for what is not finite."""
     value = value._asdict() if hasattr(value, "_asdict") else value
-    if isinstance(value, dict):
-        return {key: as_json(item) for key, item in value.items()}
+    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    if isinstance(value, Mapping):
+        return {key: as_json(item, digits) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [as_json(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
+        return [as_json(item, digits) for item in value]
+    if isinstance(value, float):
+        return None if not math.isfinite(value) else value if digits is None else round(value, digits)
     return value
 
 
