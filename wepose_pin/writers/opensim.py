@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, diagnose_lock, euler, joint_angles
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, BadOption
+from ..errors import BadData
 from ..readers.registry import OWN_STO
 from ..rotations import conjugate, multiply, rotation_about
 from ..tracking import TrackResult
@@ -58,30 +58,27 @@ _CLOSE = 1e-9  # [rad] of the last step
 def write_mot(path: Path, motion: TrackResult, names: str | None = None) -> list[Diagnostic]:
     """Write joint angles in degrees: the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
-    ``<joint>_near_lock`` is 1 where the first and the third angle of a joint are not to be read. A mechanism has the
-    joints of its URDF, in degrees or m. `names`: only "isb" or "opensim".
+    ``<joint>_near_lock`` is 1 where the first and the third angle of a joint are not to be read. `names`: only "isb" or
+    "opensim".
     """
     check_complete(motion, "a .mot")
+    if motion.model.table.is_mechanism:
+        raise BadData(f"{motion.where}: is of a mechanism, for which OpenSim has no joints; csv and rosbag hold them")
     diagnostics, angles, others = diagnose_gaps(motion), dict[str, np.ndarray](), dict[str, np.ndarray]()
-    if motion.pose.joints:
-        if names is not None:
-            raise BadOption(f"--names {names}: {motion.where} is of a mechanism, whose joints have their own names")
-        slides = {joint.name for joint in motion.model.robot.joints if joint.type == "prismatic"}
-        others = {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
-    elif names != "opensim":
+    if names != "opensim":
         isb = joint_angles(motion.pose)
         diagnostics += diagnose_lock(isb)
         for name, joint in isb.joints.items():
             angles |= {f"{name}_{angle}": joint[angle] for angle in joint}
             others[f"{name}_near_lock"] = joint.near_lock.astype(int)
-    if not motion.pose.joints and names != "isb":
+    if names != "isb":
         opensim, residuals = coordinates(orientations(motion.pose.quat_WL))
         angles |= opensim
         missed = {body: angle for body, angle in residuals.items() if angle > MOST_MISSED}
         facts: dict[str, float | str] = {"variant": "opensim"}
         for body, angle in missed.items():
             diagnostics.append(Diagnostic("orientation-residual", WARNING, body, angle, MOST_MISSED, facts))
-    if not angles and not motion.pose.joints:
+    if not angles:
         raise BadData(f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles")
     rows = pl.DataFrame({"time": motion.pose.time, **{k: np.degrees(v) for k, v in angles.items()}, **others})
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
