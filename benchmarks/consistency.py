@@ -42,10 +42,10 @@ SCORED_JOINTS, SHOULDER_SEQUENCE = ("right_shoulder", "right_elbow"), "ZXY"  # w
 FREE = "free"  # no closure: reaches, rests and typing
 
 
-def measure_person(seed: int, preset: str, protocol: str, seconds: float) -> dict[str, Any]:
+def measure_person(seed: int, preset: str, own: dict[str, Any], protocol: str, seconds: float) -> dict[str, Any]:
     """Errors [m, rad] and standard deviations of a person, by quantity: lists of pairs; or why there are none."""
     person = simulate_person(seed, PEOPLE_MEASURED_STD if preset == "people" else MEASURED_STD)
-    sizes = replace(PRESETS[preset], mount="any")
+    sizes = replace(PRESETS[preset], mount="any", **own)
     try:
         if protocol == FREE:
             simulation = simulate_activity(
@@ -162,14 +162,15 @@ def print_summary(preset: str, results: list[dict[str, Any]]) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m benchmarks.consistency", description=__doc__)
     parser.add_argument("--preset", action="append", choices=sorted(PRESETS), help="of people; may be repeated")
+    parser.add_argument("--imperfection", action="append", default=[], help="another size of one, NAME=VALUE")
     parser.add_argument("--persons", type=int, default=60, help="number of persons")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="seed of the first person")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--protocol", default="clasp", help=f"of the calibration; {FREE}: tasks without any closure")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the protocol")
     options = parser.parse_args()
+    own = {name: float(size) for name, size in (each.split("=") for each in options.imperfection)}
     for name in options.preset or list(PRESETS):
-        measure = partial(measure_person, preset=name, protocol=options.protocol, seconds=options.seconds)
+        measure = partial(measure_person, preset=name, own=own, protocol=options.protocol, seconds=options.seconds)
         with ProcessPoolExecutor(options.workers) as pool:
-            seeds = range(options.first, options.first + options.persons)
-            print_summary(name, list(pool.map(measure, seeds)))
+            print_summary(name, list(pool.map(measure, range(options.first, options.first + options.persons))))
