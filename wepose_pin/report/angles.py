@@ -23,7 +23,7 @@ SESSIONS: list[dict[str, Any]] = [  # lines of the sessions, in turn
     for colour, dashes in zip(fig.SESSION_COLOURS, ("-", "--", ":", "-."), strict=True)
 ]
 ADVICE = (
-    "State by `--repetitions` another angle, or a phase whose intervals are the repetitions, or a time by `--interval`."
+    "Name another angle by `--repetitions`, or a phase whose intervals are the repetitions, or a time by `--interval`."
 )
 CURVES = (
     "Each repetition from 0 to 100 % of its own time. Where fewer than half of the repetitions are determined, as near "
