@@ -73,9 +73,9 @@ CIRCLE = np.deg2rad(np.arange(-180.0, 180.0, 5.0))  # [rad]
 CELL_VAR = np.deg2rad(5.0) ** 2 / 12.0  # [rad²] of a heading between two of these
 PEAK = np.deg2rad(60.0)  # [rad] from the likeliest heading, as far as its peak extends
 TAIL = 4.0  # degrees of freedom of a hinge's error on that circle, whose distribution has long tails
-# A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
-# than a share of the rms misfit; found by simulated people who walk, run, throw and reach.
-COHERENT_MARGIN, LARGEST_COHERENT_SHARE = 2.0, 0.5
+# A heading may be feigned by no more than a share of the rms misfit; found by simulated people who walk, run, throw and
+# reach.
+LARGEST_COHERENT_SHARE = 0.5
 _HINGE_COLUMNS = [0, 1, 2, 2, 3]  # of a hinge's H: soft tissue twists a sensor about the same axis as the hinge's
 # Jacobian of the angle and of the two sides of a joint by its columns (`HeadingFilter._pair_columns`).
 _JOINT_JACOBIAN = np.zeros((15, 17))
@@ -320,11 +320,10 @@ class HeadingFilter:
 
         The heading variance of an orientation filter grows by the bias and the scale of its gyroscope too, which are
         states here. So its growth counts up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or
-        the gyroscope was saturated. What the filter has corrected of its heading and its bias is taken back. A bias is
-        less certain where another axis of the sensor becomes vertical.
+        the gyroscope was saturated. What the filter has corrected of its heading and its bias is taken back.
         """
         heading, rate = self._columns["heading"], self._columns["rate"]
-        gained_var, corrected, corrected_rate, gained_rate_var, _ = filters - self._last
+        gained_var, corrected, corrected_rate = (filters - self._last)[:3]
         least = self._drift_psd * self.knot_s
         gained = np.maximum(gained_var, MIN_DRIFT_PSD * self.knot_s)
         known = np.isfinite(gained)
@@ -335,7 +334,6 @@ class HeadingFilter:
         change[heading], change[rate] = -np.nan_to_num(corrected), np.nan_to_num(corrected_rate)
         drift = np.where(leaps, gained, np.minimum(gained, least))
         variance[heading] += np.where(known, drift, UNKNOWN_DRIFT_PSD * self.knot_s)
-        variance[rate] += np.nan_to_num(np.maximum(gained_rate_var, 0.0))
         quat = np.concatenate([quat_WL[:1] if self._last_quat is None else self._last_quat, quat_WL])
         self._last_quat = quat[-1:]
         turns = rotations.log(rotations.multiply(quat[1:], rotations.conjugate(quat[:-1])))
@@ -583,7 +581,7 @@ def _split_misfit(misfit: np.ndarray, correlated_samples: float) -> tuple[float,
     mixed = E[:2, 2] * np.sqrt(horizontal / max(force[2], 1e-9 * horizontal))
     parts = np.array([E[0, 0] + E[1, 1], E[0, 0] - E[1, 1], E[0, 1] + E[1, 0], *mixed, *E[2, :2]])
     by_chance = variance / horizontal * correlated_samples / samples
-    coherent = COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
+    coherent = max(float(np.mean(parts**2)) - by_chance, 0.0)
     return variance, min(coherent, LARGEST_COHERENT_SHARE**2 * variance * 2.0 * samples / horizontal)
 
 
