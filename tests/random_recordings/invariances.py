@@ -26,7 +26,7 @@ THRESHOLD_SHARE = 0.1  # of the stated standard deviation
 # time decides in which phase.
 CHATTER_DEG = 0.5
 # The others give a filter more or less of the same samples, or the same noise at another rate. That may move a pose by
-# a share of its ±; where nothing is stated, by so many degrees.
+# a share of its ± beside what those samples tell; where nothing is stated, by so many degrees.
 MOST_Z, UNSTATED_DEG = 1.0 / 3.0, 5.0
 STANDING_S = 60.0
 
@@ -121,11 +121,16 @@ def _find_difference(base: tuple[Result, float], other: tuple[Result, float], of
         k = int(np.argmax(angle))
         degrees, z = float(np.degrees(angle[k])), 0.0
         if std is not None and of.most_deg is None:
-            ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows], 1e-9))
+            over, var = np.maximum(angle - FLOOR_RAD, 0.0) / ALL_AXES, np.maximum(std[rows], 1e-9) ** 2
             if of.variant.finer > 1:
                 # When a motion ends is known to a sample of the coarser recording: what a filter corrects there, the
                 # other rate may correct within that sample, and what both agree on at the next one is no difference.
-                ratio = np.minimum(ratio[1:], ratio[:-1])
+                ratio = np.minimum(over[1:] / np.sqrt(var[1:]), over[:-1] / np.sqrt(var[:-1]))
+            else:
+                # Samples that one of them lacks tell of all times. A right estimate moves by what it learns, whose mean
+                # square is what its variance falls by: its corrections and the error that is left are uncorrelated.
+                learned = np.abs(var - two.quat_std[segment][rows_two] ** 2)
+                ratio = over / np.sqrt(var + learned / MOST_Z**2)
             z = float(ratio.max())
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
         if most is not None and std is None:
