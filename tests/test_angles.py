@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import Pose, WeposeError, joint_angles
+from wepose_pin.angles import JointAngles
 
 ARM = ("upper_arm", "forearm", "hand")
 LEG = ("thigh", "shank", "foot")
@@ -40,6 +41,14 @@ def arm_of(side: str, matrix_I: np.ndarray) -> dict[str, np.ndarray]:
     if side == "left":
         matrix = MIRROR @ matrix @ MIRROR
     return {f"{side}_upper_arm": Rotation.from_matrix(matrix).as_quat()}
+
+
+def check_values(joint: JointAngles) -> None:
+    """They are those of the joint's rotation, and jump near the lock at most."""
+    back = Rotation.from_euler(joint.sequence, joint.values).inv() * Rotation.from_quat(joint.quat)
+    assert back.magnitude().max() < 1e-12
+    jumps = np.abs(np.diff(joint.values, axis=0)).max(axis=1) > np.radians(60.0)
+    assert not np.any(jumps & ~(joint.near_lock[1:] & joint.near_lock[:-1]))
 
 
 # Closed forms over time -------------------------------------------------------------------------------------------
@@ -81,11 +90,18 @@ def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side
     shoulder = joint_angles(pose_with(arm_of(side, R.as_matrix())))[f"{side}_shoulder"]
     for middle, plane in ((400, 0.0), (900, 90.0)):
         np.testing.assert_allclose(np.degrees(shoulder.values[middle]), [plane, -110.0, -plane], atol=0.1)
-    jumps = np.abs(np.diff(shoulder.values, axis=0)).max(axis=1) > np.radians(60.0)
-    assert not np.any(jumps & ~(shoulder.near_lock[1:] & shoulder.near_lock[:-1]))
-    assert (
-        Rotation.from_euler("YXY", shoulder.values).inv() * Rotation.from_quat(shoulder.quat)
-    ).magnitude().max() < 1e-12
+    check_values(shoulder)
+
+
+@pytest.mark.parametrize("name", ["XZY", "auto"])
+def test_an_arm_hangs_at_zero_whatever_way_it_takes(name: str) -> None:
+    """Straight forward and up to 150°, through the lock of X-Z-Y; down sideways; and the same way back."""
+    degrees = np.array([[90.0, 0.0], [90.0, 0.0], [90.0, 150.0], [90.0, 150.0], [0.0, 150.0], [0.0, 0.0], [0.0, 0.0]])
+    plane, raised = (np.interp(np.linspace(0.0, 6.0, 6001), range(7), column) for column in degrees.T)
+    way = Rotation.from_euler("YXY", np.column_stack([plane, -raised, -plane]), degrees=True).as_matrix()
+    shoulder = joint_angles(pose_with(arm_of("right", np.concatenate([way, way[::-1]]))), name)["right_shoulder"]
+    np.testing.assert_allclose(shoulder.values[np.tile(raised == 0.0, 2)], 0.0, atol=1e-9)
+    check_values(shoulder)
 
 
 @pytest.mark.parametrize("raised", [False, True])
@@ -102,10 +118,7 @@ def test_full_turns_do_not_add_up_while_an_arm_hangs(raised: bool) -> None:
     plane, _, internal = np.degrees(shoulder.values).T
     assert np.abs(plane - np.degrees(0.5 * raised)).max() <= 180.0 + 1e-9
     assert np.abs(np.diff(plane + internal)).max() < 5.0  # how far the arm is turned about its length
-    jumps = np.abs(np.diff(plane)) > 60.0
-    assert not np.any(jumps & ~(shoulder.near_lock[1:] & shoulder.near_lock[:-1]))
-    back = Rotation.from_euler("YXY", shoulder.values).inv() * Rotation.from_quat(shoulder.quat)
-    assert back.magnitude().max() < 1e-9
+    check_values(shoulder)
 
 
 # Against SciPy, on frames from bony landmarks as Wu et al. define them ----------------------------------------------

@@ -98,10 +98,12 @@ def follow(angles: tuple[np.ndarray, np.ndarray], name: str, near_lock: float) -
     """Follow the angles of `decompose` over time (n, 3), unwrapped: the solutions that continue each other.
 
     A motion that goes straight through the lock keeps its first and third angle, and the second goes on beyond its
-    principal range. What the motion does within `near_lock` [rad] of the lock does not count, only how it came and how
-    it left: on the plane of the first angle on which it came (within 45°), to either side, it is continued. Where it
-    left on another there is nothing to continue, and what follows is read anew, in the principal range for the most
-    part. Near the lock the first angle is within a right angle of that with which the motion came, and from the sample
+    principal range. What the motion does within `near_lock` [rad] of the lock does not count. A sequence of two axes is
+    continued where it left on the plane of the first angle on which it came (within 45°), to either side. Where it left
+    on another there is nothing to continue, and what follows is read anew, in the principal range for the most part. A
+    sequence of three axes is read anew after each lock, so that no way leads to another solution for the same posture:
+    the angles are the ones nearest to zero at the posture nearest to zero; without a lock, in the principal range.
+    Near the lock the first angle is within a right angle of that with which the motion came, and from the sample
     nearest to the lock on of that with which it left (else of zero); no full turns add up there, and the sum or
     difference with the third, which is determined, goes on.
     """
@@ -112,7 +114,7 @@ def follow(angles: tuple[np.ndarray, np.ndarray], name: str, near_lock: float) -
     groups: list[list[tuple[int, int]]] = []  # of stretches that continue each other
     for a, b in find_runs(gimbal >= near_lock):
         part, continues = _continue(principal[a:b], s), False
-        if groups:
+        if groups and not s.offset:
             last = values[groups[-1][-1][1] - 1]
             change = abs(float(wrap(part[0, 0] - last[0])))
             continues = not 0.25 * np.pi <= change <= 0.75 * np.pi
@@ -124,9 +126,13 @@ def follow(angles: tuple[np.ndarray, np.ndarray], name: str, near_lock: float) -
         index = np.concatenate([np.arange(a, b) for a, b in group])
         part, weights = values[index], gimbal[index]
         beyond = np.cos(part[:, 1] - principal[index, 1]) < 1.0 - 1e-9
-        if weights[beyond].sum() > weights[~beyond].sum():
-            part = _solve_otherwise(part, s)
-        values[index] = part - round_to_turns(part[np.argmax(weights)])
+        swap, clear = weights[beyond].sum() > weights[~beyond].sum(), np.argmax(weights)
+        if s.offset and len(groups) > 1:  # of the absolute angles' sum the other solution has the rest to 3π
+            total = np.abs(wrap(part)).sum(axis=1)
+            clear = np.argmin(np.minimum(total, 3.0 * np.pi - total) // near_lock)  # the first one within that
+            swap = total[clear] > 1.5 * np.pi
+        part = _solve_otherwise(part, s) if swap else part
+        values[index] = part - round_to_turns(part[clear])
     for a, b in find_runs(gimbal < near_lock):
         middle = a + int(np.argmin(gimbal[a:b]))
         middle = b if b == len(values) else a if a == 0 else middle
