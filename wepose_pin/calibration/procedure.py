@@ -233,7 +233,7 @@ def list_mount_alternatives(stated: Calibration) -> list[Alternative]:
 
 
 def list_label_alternatives(stated: Calibration) -> list[Alternative]:
-    """Return exchanges of two sensors, and of both sides; none where the limbs move as a person's.
+    """Return exchanges of two sensors, and of both sides; none where limbs move as a person's or a gyroscope is wrong.
 
     Joined hands close the chain for some exchanged sensors as well: left for right, or upper arm for forearm of a side,
     give the same gap. The solution's elbows then bend backward, or sideways, as a person's cannot. Any other exchange
@@ -241,6 +241,8 @@ def list_label_alternatives(stated: Calibration) -> list[Alternative]:
     """
     rotations, table = [*measure_rotations(stated).values()], stated.problem.model.table
     if measure_doubt(stated)[0] <= 1.0 or table.is_mechanism or not rotations or np.median(rotations) < LEAST_ROTATION:
+        return []
+    if any(each.code == "gyro-contradicted" for each in stated.problem.recording.diagnostics):
         return []
     places = [name for name in stated.problem.layout.sensors if name in table.needed]
     exchanges = [dict((pair, pair[::-1])) for pair in combinations(places, 2)]

@@ -17,7 +17,7 @@ from ..errors import BadData, WrongUnit
 from ..readers.live_log import Markers, build_recording
 from ..recording import Intervals, Recording
 from ..recording.arrivals import Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
-from ..recording.plausibility import check_signals, find_unseen_rate
+from ..recording.plausibility import find_unseen_rate
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from .log import LiveLog
 from .setup import SensorSetup
@@ -111,7 +111,7 @@ class SensorMonitor:
 def check_units(recording: Recording) -> tuple[Diagnostic, ...]:
     """Check the sensors' values as those of a file; raises `BadData`, which says how a source states another unit."""
     try:
-        return check_signals(recording)
+        return recording.check_signals()
     except WrongUnit as error:
         raise BadData(f"{error.finding}: {error.unit}? {STATE_UNIT.format(error.key, error.unit)}") from None
 

@@ -24,7 +24,6 @@ from ..recording import CONFIGURATION, ImuSensor, OrientationSensor, Recording, 
 from ..recording.clocks import TIME_UNITS, Clock
 from ..recording.faults import Fault, check_sensors
 from ..recording.intervals import Intervals, check_phases, find_runs, format_span
-from ..recording.plausibility import check_signals
 from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device, check_measured
 from .live_log import is_live_log as is_live_log
@@ -284,7 +283,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     rate_hz = clocks.measure_rate(time)
     recording = replace(head, time=time, rate_hz=rate_hz, sensors=sensors, diagnostics=tuple(diagnostics))
     recording.check(units=False)
-    return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
+    return replace(recording, diagnostics=(*recording.diagnostics, *recording.check_signals()))
 
 
 def _once(contents: dict[Any, Any], key: Any, read: Callable[..., T], *arguments: Any) -> T:

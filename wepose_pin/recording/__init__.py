@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import rotations
 from ..arguments import EACH_TIME, Positive, check_array, check_fields, check_names, check_value
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import TomlTable
-from ..errors import BadData, BadOption, BadPhase, one_of
+from ..errors import BadData, BadOption, BadPhase, WrongUnit, one_of
 from .faults import check_arrays
 from .intervals import Intervals as Intervals
 from .intervals import check_phases as check_phases
@@ -29,9 +28,12 @@ from .intervals import format_span as format_span
 from .intervals import format_time as format_time
 from .intervals import select_interval as select_interval
 from .limits import MEDIAN_FORCE
-
-# Names of sensor axes in a stated mount.
-AXES = {sign + axis: s * np.eye(3)[k] for sign, s in (("+", 1.0), ("-", -1.0)) for k, axis in enumerate("xyz")}
+from .plausibility import check_signals
+from .sensors import AXES as AXES
+from .sensors import ImuSensor as ImuSensor
+from .sensors import OrientationSensor as OrientationSensor
+from .sensors import Sensor as Sensor
+from .sensors import compute_rate as compute_rate
 
 
 def compute_mount(up: str, forward: str) -> np.ndarray:
@@ -56,75 +58,6 @@ def find_mount_axes(quat_LS: np.ndarray) -> tuple[str, str]:
     R_LS = Rotation.from_quat(quat_LS)
     pairs = [(up, forward) for up in AXES for forward in AXES if AXES[up] @ AXES[forward] == 0.0]
     return min(pairs, key=lambda pair: (R_LS * Rotation.from_quat(compute_mount(*pair)).inv()).magnitude())
-
-
-@dataclass(frozen=True)
-class ImuSensor:
-    """The measurements of a gyroscope and an accelerometer, n samples in the sensor's frame S.
-
-    Parameters
-    ----------
-    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S : (n, 3) [m/s²], specific force: a static sensor measures g, upward
-    stated_quat_LS : (4,) xyzw, the mount that the session states: sensor frame S to segment frame L; None: not stated
-    gap : (n,) bool, true where samples were lost for longer than 50 ms, or repeat one value, and were interpolated;
-        None: there are none
-    gyro_range : [rad/s] at which an axis of gyro saturates; infinite: not known
-    """
-
-    gyro_S: np.ndarray
-    accel_S: np.ndarray
-    stated_quat_LS: np.ndarray | None = None
-    gap: np.ndarray | None = None
-    gyro_range: float = np.inf
-    aligned = False  # measured orientations alone can be
-
-    def __repr__(self) -> str:
-        return f"ImuSensor({len(self.gyro_S)} samples)"
-
-    def part(self, samples: slice | np.ndarray) -> ImuSensor:
-        """Return the sensor at these samples."""
-        gap = None if self.gap is None else self.gap[samples]
-        return replace(self, gyro_S=self.gyro_S[samples], accel_S=self.accel_S[samples], gap=gap)
-
-
-@dataclass(frozen=True)
-class OrientationSensor:
-    """The orientations that a device measured, n samples; they are used as they are, without a filter of this package.
-
-    Parameters
-    ----------
-    quat_VS : (n, 4) xyzw, sensor frame S to a world V of the device's own: its z points up, its heading is arbitrary
-    stated_quat_LS, gap : as in `ImuSensor`
-    aligned : `quat_VS` is the orientation of the segment, not of the sensor, in a world that all aligned sensors
-        share; the start pose gives the heading of that world
-    """
-
-    quat_VS: np.ndarray
-    stated_quat_LS: np.ndarray | None = None
-    gap: np.ndarray | None = None
-    aligned: bool = False
-
-    def __repr__(self) -> str:
-        return f"OrientationSensor({len(self.quat_VS)} samples)"
-
-    def part(self, samples: slice | np.ndarray) -> OrientationSensor:
-        """Return the sensor at these samples."""
-        return replace(self, quat_VS=self.quat_VS[samples], gap=None if self.gap is None else self.gap[samples])
-
-
-Sensor = ImuSensor | OrientationSensor
-
-
-def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
-    """Compute the rate (n, 3) [rad/s] in S over the interval that ends at each sample.
-
-    Of measured orientations the first rate is a copy of the second.
-    """
-    if isinstance(sensor, ImuSensor):
-        return sensor.gyro_S
-    rate = rotations.compute_turns(sensor.quat_VS) * rate_hz
-    return np.concatenate([rate[:1], rate])
 
 
 # Recordings ----------------------------------------------------------------------------------------------------------
@@ -226,7 +159,7 @@ class Recording:
         Raises
         ------
         WeposeError
-            As `check`; a sensor that is neither, or that is dead or frozen.
+            As `check` and `check_signals`; a sensor that is neither, or that is dead or frozen.
 
         Examples
         --------
@@ -252,9 +185,14 @@ class Recording:
             else:
                 raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
             count = count or len(np.atleast_1d(values[0] if isinstance(values, tuple) else values))
-        recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check()
+        recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check(units=False)
         check_arrays(f"{name}: sensors.", rate_hz, {each: (s.gyro_S, s.accel_S) for each, s in recording.imus.items()})
-        return recording
+        try:
+            return replace(recording, diagnostics=recording.check_signals())
+        except WrongUnit as error:
+            raise BadData(
+                f"{error.finding}; gyro_S in rad/s, accel_S in m/s² and the right rate_hz are needed"
+            ) from None
 
     def check(self, units: bool = True) -> Recording:
         """Check a recording and return it; `units`: its unit of force too, by the median.
@@ -304,6 +242,10 @@ class Recording:
                 text = f"{where}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed"
                 raise BadData(f"{text}, 9.8 where nothing moves")
         return self
+
+    def check_signals(self) -> tuple[Diagnostic, ...]:
+        """Check the sensors' values as `plausibility.check_signals` does."""
+        return check_signals(self.where(), self.time, self.rate_hz, self.phases, self.imus)
 
     @property
     def imus(self) -> dict[str, ImuSensor]:
