@@ -11,14 +11,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from wepose_pin.filters import GdcParams, NcfParams
 
-# The grid: zero, which leaves the term out, and steps of a quarter or half a decade.
-PROPORTIONAL = (0.0, *np.logspace(-3.0, 0.5, 15))  # [1/s] k_P
-INTEGRAL = (0.0, *np.logspace(-6.0, -1.0, 11))  # [1/s²] k_I
-DESCENT = (0.0, *np.logspace(-5.0, -0.5, 19))  # [1/s] β
 HALVES = ({"01", "05", "09", "14", "21", "27", "31", "35"}, {"03", "07", "11", "16", "25", "29", "33"})  # of BROAD
 
 
@@ -29,26 +23,18 @@ class Gains(NamedTuple):
     gdc: GdcParams
 
 
-def _grid_points(proportional: float, integral: float, descent: float) -> Gains:
-    """Find the grid points of these rounded values."""
-    nearest = [
-        float(min(axis, key=lambda point: abs(point - rounded)))
-        for axis, rounded in ((PROPORTIONAL, proportional), (INTEGRAL, integral), (DESCENT, descent))
-    ]
-    return Gains(NcfParams(*nearest[:2]), GdcParams(nearest[2]))
-
-
 # Sensor noise alone and a minute without rest: with the bias removed the accelerometer has next to nothing to add, and
 # GDC is best without it, that is with the gyroscope integrated.
+# The grid was zero, which leaves a term out, and steps of a quarter of a decade, of k_I half a decade.
 STATED = {
-    "simulated 100 Hz": _grid_points(0.0032, 1e-4, 0.0),
-    "simulated 1 kHz": _grid_points(0.0032, 3.2e-5, 0.0),
-    "upper body, ideal": _grid_points(0.032, 1e-5, 5.6e-4),
-    "upper body, mild": _grid_points(0.1, 0.0, 1.8e-3),
-    "upper body, people": _grid_points(0.32, 0.0, 0.01),
-    "BROAD, first half": _grid_points(0.1, 1e-3, 0.018),
-    "BROAD, second half": _grid_points(0.056, 3.2e-4, 0.01),
-    "BROAD": _grid_points(0.1, 1e-3, 0.018),
+    "simulated 100 Hz": Gains(NcfParams(10.0**-2.5, 1e-4), GdcParams(0.0)),
+    "simulated 1 kHz": Gains(NcfParams(10.0**-2.5, 10.0**-4.5), GdcParams(0.0)),
+    "upper body, ideal": Gains(NcfParams(10.0**-1.5, 1e-5), GdcParams(10.0**-3.25)),
+    "upper body, mild": Gains(NcfParams(0.1, 0.0), GdcParams(10.0**-2.75)),
+    "upper body, people": Gains(NcfParams(10.0**-0.5, 0.0), GdcParams(0.01)),
+    "BROAD, first half": Gains(NcfParams(0.1, 1e-3), GdcParams(10.0**-1.75)),
+    "BROAD, second half": Gains(NcfParams(10.0**-1.25, 10.0**-3.5), GdcParams(0.01)),
+    "BROAD": Gains(NcfParams(0.1, 1e-3), GdcParams(10.0**-1.75)),
 }
 
 
