@@ -97,13 +97,15 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
         assert not segments.diagnostics
 
 
-def test_a_calibrated_mount_that_has_moved_is_said() -> None:
-    moved = Rotation.from_rotvec([0.0, np.deg2rad(20.0), 0.0])
+@pytest.mark.parametrize(("off", "sure", "text"), [(20.0, 1.0, "mounted again"), (36.0, 20.0, "calibrate again")])
+def test_a_calibrated_mount_that_has_moved_is_said(off: float, sure: float, text: str) -> None:
+    moved = Rotation.from_rotvec([0.0, np.deg2rad(off), 0.0])
     recording, _ = ready_recording({"torso": 0.0}, {"torso": moved * MOUNT})
-    subject = mounted("torso", np.deg2rad(1.0) ** 2 * np.eye(3))
+    subject = mounted("torso", np.deg2rad(sure) ** 2 * np.eye(3))
     (diagnostic,) = estimate_segments(recording, subject).diagnostics
     assert (diagnostic.code, diagnostic.place) == ("mount-contradicted", "torso")
-    assert diagnostic.value == pytest.approx(np.deg2rad(20.0), abs=0.01)
+    assert diagnostic.value == pytest.approx(np.deg2rad(off), abs=0.01)
+    assert text in str(diagnostic)
 
 
 def test_a_person_stands_as_in_the_calibration() -> None:

@@ -35,6 +35,11 @@ def test_what_lies_beyond_a_loss_is_not_used(simulation: Simulation) -> None:
     assert unused.value == pytest.approx(end - begin - 14.0, abs=0.05)
     upto = replace(recording, phases={**recording.phases, "clasp": ((begin, begin + 13.99),)})
     assert calibration.subject.lengths == pytest.approx(calibrate(upto).subject.lengths, rel=1e-3)
+    posed = replace(recording, phases={**recording.phases, "t_pose": ((end - 3.0, end),)})
+    assert calibrate(posed).subject.lengths == calibration.subject.lengths
+    assert [each.place for each in calibrate(posed).diagnostics if each.code == "phase-not-used"] == ["t_pose"]
+    with pytest.raises(WeposeError, match=r"phases\.t_pose has 0\.0 s in which"):
+        calibrate(posed, protocol="clasp+t_pose")
 
 
 def test_a_loss_between_the_start_pose_and_the_motion_is_one_line(simulation: Simulation) -> None:

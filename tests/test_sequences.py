@@ -37,14 +37,10 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     simulation = wp.simulate_activity("tasks", seed=4, seconds=40.0, **options)
     recording = simulation.recording()
     calibration = calibrate(recording, prior=person.prior, protocol="free")
-    mounts = {name: Rotation.from_quat(quat) for name, quat in calibration.subject.mounts.items()}
-    errors = np.array(
-        [
-            (R * Rotation.from_quat(simulation.quat_LS[name]).inv()).as_rotvec(degrees=True)[2]
-            for name, R in mounts.items()
-        ]
-    )
-    std = max(calibration.subject.std(f"mounts.{name}.z") for name in calibration.subject.mounts)
+    mounts = calibration.subject.mounts
+    off = [Rotation.from_quat(mounts[name]) * Rotation.from_quat(simulation.quat_LS[name]).inv() for name in mounts]
+    errors = np.array([each.as_rotvec(degrees=True)[2] for each in off])
+    std = max(calibration.subject.std(f"mounts.{name}.z") for name in mounts)
     assert np.abs(errors).max() < 2.0 * np.degrees(std) < 40.0
     assert np.ptp(errors) < 4.0  # against each other by the accelerations of the joints
     assert calibration.subject.lengths == pytest.approx(person.prior.lengths, rel=1e-9)
@@ -52,6 +48,10 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     assert calibration.quality.quality != "pass"
     still = replace(recording, phases={"start": ((0.5, 1.5),)}).cut(recording.span((0.0, 4.9)))
     assert calibrate(still, prior=person.prior, protocol="free").quality.quality == "fail"
+    arm = replace(recording, sensors={name: recording.imus[name] for name in ("left_upper_arm", "left_forearm")})
+    assert list(calibrate(arm, prior=person.prior, protocol="free").subject.mounts) == list(arm.sensors)
+    with pytest.raises(WeposeError, match="free motion needs sensors on left_upper_arm and left_forearm, or on right"):
+        calibrate(replace(arm, sensors={"left_forearm": arm.imus["left_forearm"]}), protocol="free")
 
 
 def test_an_earlier_calibration_adds_what_it_knows() -> None:

@@ -192,7 +192,7 @@ def align_sensors(
     nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
     mounts: dict[str, Rotation] = {}
     heading_offsets: dict[str, float] = {}
-    repeats = list[float]()
+    repeats, facts = list[float](), dict[str, float | str]()
     # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     for segment, R_VS in R_VS_start.items():
@@ -215,9 +215,9 @@ def align_sensors(
                 f"{recording.where()}: sensors.{segment}{name} is {np.degrees(tilt_error):.0f} deg off gravity in the "
                 f"start pose ({format_span(start)}); {remedy}, or the seconds of the start pose in [phases]"
             )
-        if tilt_error > limit:
-            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit))
         mount_cov = find_mount_covariance(recording, segment, subject, start_pose)
+        if tilt_error > limit and mount_cov is None:
+            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit))
         if mount_cov is not None and subject is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
@@ -234,7 +234,10 @@ def align_sensors(
             stds, value = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5, float(np.linalg.norm(misfit))
             if stds > MOUNT_MOVED_STDS:
                 limit = value * MOUNT_MOVED_STDS / stds  # [rad] in the direction of the misfit
-                facts: dict[str, float | str] = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
+                facts = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
                 diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
+            elif tilt_error > limit:
+                facts = {"variant": "as-calibrated"}
+                diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit, facts))
         mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi
     return mounts, heading_offsets, diagnostics, estimate_repeat_share(repeats)

@@ -62,7 +62,8 @@ class Subject:
     name : of the person
     lengths : name → [m], as the table of the body names them
     order : names of the k rows of `covariance`: lengths [m]; ``mounts.<segment>.x``, ``.y``, ``.z`` [rad], the error of
-        a mount as a rotation vector in the segment's frame L; ``girdles.<point>.law`` (no unit), ``.rest_x`` … [m]
+        a mount as a rotation vector in the segment's frame L, about the vertical relative to the start pose as held;
+        ``girdles.<point>.law`` (no unit), ``.rest_x`` … [m]
     covariance : (k, k) of the errors of what `order` names
     mounts : segment → `quat_LS` (4,) xyzw, its sensor's mount (S to L); empty where none is calibrated
     note : where the numbers come from, in a few words

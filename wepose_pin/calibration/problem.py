@@ -224,6 +224,13 @@ class CalibrationProblem:
         gaps = [sensor.gap for sensor in self.recording.sensors.values() if sensor.gap is not None]
         return self.connected[0] & ~np.any([np.zeros(len(self.recording), dtype=bool), *gaps], axis=0)
 
+    @property
+    def short_phases(self) -> dict[str, float]:
+        """The phases of which less than `LEAST_S` is usable → how much is [s]."""
+        phases = zip(self.layout.conditions, self.phase_samples, strict=True)
+        seconds = {each.phase: float(self.usable[samples].sum()) / self.recording.rate_hz for each, samples in phases}
+        return {phase: time for phase, time in seconds.items() if time < LEAST_S}
+
     @cached_property
     def couplings(self) -> Couplings | None:
         """The relative headings of neighbours by the acceleration of the joint between them."""

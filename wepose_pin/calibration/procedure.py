@@ -45,8 +45,8 @@ from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
 from .headings import add_couplings, search_headings
 from .least_squares import CONTRADICTED, LeastSquares, compare_measured, estimate_covariance, solve_reweighted
 from .paper import Formulation, solve_paper_calibration
-from .problem import SAMPLE_RATE_HZ, CalibrationProblem, find_layout
-from .protocols import Closure, FreeMotion, Protocol, choose_protocol, load_protocol
+from .problem import LEAST_S, SAMPLE_RATE_HZ, CalibrationProblem, find_layout
+from .protocols import ALSO, Closure, FreeMotion, Protocol, choose_protocol, load_protocol
 from .result import LEAST_ROTATION, OTHER_HEADING, Calibration, assess, measure_doubt, measure_rotations
 
 # One standard deviation [m] of a length measured over the skin, where the user gives none.
@@ -141,8 +141,9 @@ def calibrate(
     """
     check_arguments(calibrate, locals())
     check_method(method)
+    is_stated = protocol is not None
     if not isinstance(protocol, Protocol):
-        protocol = load_protocol(choose_protocol(recording.phases, formulation) if protocol is None else protocol)
+        protocol = load_protocol(protocol or choose_protocol(recording.phases, formulation))
     if not isinstance(model, BodyModel):
         model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
     _check_inputs(recording, protocol, model, measured or {})
@@ -158,6 +159,12 @@ def calibrate(
     if earlier is not None:  # the two calibrations are fused, each on the population prior
         prior = separate_mounts(earlier, population_subject(body=model))
     problem = CalibrationProblem(recording, R_VS, start, find_layout(protocol, model, recording), prior, lengths)
+    short = {} if is_stated else {phase: time for phase, time in problem.short_phases.items() if phase in ALSO}
+    if short:  # the phases of the default protocol without which it works as well
+        unused = [Diagnostic("phase-not-used", WARNING, phase, time, LEAST_S) for phase, time in short.items()]
+        recording = replace(recording, diagnostics=(*recording.diagnostics, *unused))
+        protocol = load_protocol(choose_protocol(recording.phases.keys() - short.keys(), formulation))
+        problem = replace(problem, recording=recording, layout=find_layout(protocol, model, recording))
     calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
     if earlier is not None:
         fused = fuse_calibrations(earlier, calibration.subject, model.table)

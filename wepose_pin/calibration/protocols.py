@@ -157,7 +157,11 @@ class Protocol:
                     points = " and ".join(condition.points)
                     raise BadSession(f"{where}{moves} {points}; points that move against each other are needed")
                 paths[condition] = own
-            elif not isinstance(condition, FreeMotion):
+            elif isinstance(condition, FreeMotion):
+                hinges = [f"{hinge.on} and {hinge.moves}" for hinge in table.hinges.values()]
+                if hinges and not any({hinge.on, hinge.moves} <= sensors.keys() for hinge in table.hinges.values()):
+                    raise BadSession(f"{where}free motion needs sensors on {', or on '.join(hinges)}")
+            else:
                 segment, reference = condition.segment, table.reference
                 for each in (segment, reference) if isinstance(condition, Direction) else (segment,):
                     if each not in sensors:
