@@ -58,9 +58,9 @@ from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 
 GAP_ROWS = 3  # residuals of a sample's condition
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
-# [rad] of orientations, of which only ratios matter: arms 60 deg off hanging, as hands are joined before the chest, and
-# links where nothing is soft.
-USUAL_ELEVATION, RIGID_ATTITUDE_STD = np.deg2rad(60.0), np.deg2rad(1.5)
+# [rad] of orientations, of which only ratios matter: arms 60 deg off hanging, as hands are joined before the chest, the
+# trunk 15 deg off upright, as it leans with them (Gates 2016: 23 deg at most), and links where nothing is soft.
+USUAL_ELEVATION, USUAL_LEAN, RIGID_ATTITUDE_STD = np.deg2rad((60.0, 15.0, 1.5))
 # Standard deviations of the prior.
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
 LEAST_FOAM_STD = 1e-4  # [rad/rad] about an axis about which a table states that no foam gives
@@ -97,7 +97,8 @@ class Layout:
         self.soft = [name for name in self.sensors if any(table.segments[name].foam_std)]  # sensors on a foam
         self.attitude_std = dict[str, float]()  # [rad] of each orientation about an axis across its segment
         for name, tissue in tissues.items():
-            growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
+            tilt = USUAL_ELEVATION if tissue.relative_to else USUAL_LEAN
+            growth = np.hypot(tilt * np.array(tissue.per_tilt), USUAL_ELEVATION * np.array(tissue.per_raised))
             std = float(np.sqrt(np.mean(np.square(tissue.std) + growth**2)))
             self.attitude_std[name] = std or RIGID_ATTITUDE_STD
         self.size = 0  # m
