@@ -90,11 +90,14 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
         rate_change = np.linalg.inv(change_cov) / squared_bound
     # Beyond white noise (1) and (2) allow what they would with that of `WHITE_RATE_HZ`, and twice its own scatter
     white_share = max(WHITE_RATE_HZ / rate_hz, 4.0 * np.sqrt(3.0 / n)) if np.isfinite(test.rate_stds) else 1.0
-    more_white = (white_share - 1.0) * np.eye(3)[_UPPER]
-    limits = [
-        test.alpha * noise.gyro_cov[_UPPER] + (test.alpha - 1.0) * np.trace(noise.bias_step_cov) / 6.0 * more_white,
-        test.beta * noise.accel_cov[_UPPER] + (test.beta - 1.0) * noise.accel_step_var / 2.0 * more_white,
-    ]
+    limits = []
+    for factor, cov, white_var in (
+        (test.alpha, noise.gyro_cov, np.trace(noise.bias_step_cov) / 6.0),
+        (test.beta, noise.accel_cov, noise.accel_step_var / 2.0),
+    ):
+        if white_share < 1.0:  # what is taken away, the quietest axis has too
+            white_var = min(white_var, np.linalg.norm(cov, -2))
+        limits.append((factor * cov + (factor - 1.0) * (white_share - 1.0) * white_var * np.eye(3))[_UPPER])
     model = make_record(
         inverse_gravity=1.0 / noise.gravity,  # [s²/m]
         # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
