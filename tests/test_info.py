@@ -102,7 +102,8 @@ def test_a_session_elsewhere_names_the_data_from_there(capsys: pytest.CaptureFix
     info(capsys, path, "-o", tmp_path / "mine.toml")
     assert 'file = "data/trial.mvnx"' in (tmp_path / "mine.toml").read_text(encoding="utf-8")
     assert len(wp.load_session(tmp_path / "mine.toml")) == 100
-    assert "not a file that can be written" in info(capsys, path, "-o", tmp_path / "no" / "mine.toml", code=2)
+    for wrong in (tmp_path / "no" / "mine.toml", tmp_path / "data"):  # no such folder; a folder
+        assert f"{wrong}: not a file that can be written" in info(capsys, path, "-o", wrong, code=2)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -97,9 +97,6 @@ def test_ranges_are_as_uncertain_as_drawn_errors_make_them(side: str, tmp_path: 
     assert stated == pytest.approx(np.degrees(max(spreads)), rel=0.1)
 
 
-# The command ------------------------------------------------------------------------------------------------------
-
-
 def test_two_sessions_become_tables_figures_and_a_page(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -184,11 +184,10 @@ def test_a_robots_joints_are_in_a_csv_and_not_in_a_mot(tmp_path: Path) -> None:
     (tmp_path / "arm.toml").write_text(ROBOT_TABLE, encoding="utf-8")
     swing = np.sin(np.arange(0.0, 2.0, 0.02))
     result = as_result(load_model(tmp_path / "arm.toml"), swing, np.full(len(swing), 0.3))
-    pose = replace(result.pose, joints=result.joints)
-    result = replace(result, pose=pose)
+    result = replace(result, pose=replace(result.pose, joints=result.joints))
     with pytest.raises(WeposeError, match="is of a mechanism"):
         export(result, tmp_path / "m.mot")
     export(result, tmp_path / "m.csv")
     table = pl.read_csv(tmp_path / "m.csv")
-    for name, each in pose.joints.items():
+    for name, each in result.joints.items():
         np.testing.assert_allclose(table[name], each, atol=1e-6)

@@ -278,10 +278,7 @@ def test_wepose_evaluate_says_what_was_fitted(
 
 @pytest.mark.parametrize(
     ("options", "says"),
-    [
-        (("--fit", "world", "--interval", "1", "5"), "seconds after"),
-        (("--markers", "m.toml"), "has no markers"),
-    ],
+    [(("--fit", "world", "--interval", "1", "5"), "seconds after"), (("--markers", "m.toml"), "has no markers")],
 )
 def test_options_that_do_not_go_together(
     options: tuple[str, ...], says: str, result: Path, capsys: pytest.CaptureFixture[str]

@@ -129,9 +129,6 @@ def test_a_motion_at_random_is_hardly_ever_taken_for_repetitions() -> None:
     assert taken <= 1
 
 
-# The main angle ---------------------------------------------------------------------------------------------------
-
-
 def test_the_main_angle_is_that_of_the_largest_range_that_is_known() -> None:
     wave = np.sin(np.linspace(0.0, 20.0, 1000))
     bent = {"left_forearm": 50.0 * wave, "right_forearm": 20.0 * wave}
@@ -162,9 +159,6 @@ def test_the_cmc_is_kadabas() -> None:
     total = sum((curves[i, t] - curves.mean()) ** 2 for i in range(7) for t in range(50)) / (7 * 50 - 1)
     assert compute_cmc(curves) == pytest.approx(np.sqrt(1.0 - within / total), abs=1e-12)
     assert compute_cmc(np.tile(curves[0], (3, 1))) == 1.0
-
-
-# People -----------------------------------------------------------------------------------------------------------
 
 
 def test_the_arm_swings_of_a_real_walk_are_found(data: Path) -> None:

@@ -361,10 +361,10 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
 
 def check_output(file: Path, force: bool = False) -> None:
     """Raise `ExistingOutput` where `file` exists and `force` is false, or it cannot be a file."""
-    if file.exists() and not force:
-        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
     if file.is_dir() or not file.absolute().parent.is_dir():
         raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
+    if file.exists() and not force:
+        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
 
 
 @contextmanager

@@ -38,7 +38,7 @@ def view(
     Parameters
     ----------
     result
-        Folder that `wepose track` wrote.
+        Folder that `wepose track` or, of a robot, `wepose retarget` wrote.
     out
         Write the page to this file. Without it view.html in RESULT is used, and written if it is missing.
     open

@@ -27,10 +27,10 @@ _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 def check_absent(path: Path, force: bool) -> None:
     """Raise `ExistingOutput` where a file is there that must not be replaced, or none can be written."""
-    if path.exists() and not force:
-        raise ExistingOutput(f"{path}: exists; --force replaces it, --record names another file")
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise ExistingOutput(f"{path}: cannot be written; --record names another file")
+    if path.exists() and not force:
+        raise ExistingOutput(f"{path}: exists; --force replaces it, --record names another file")
 
 
 class LiveLog:
