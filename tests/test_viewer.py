@@ -87,8 +87,6 @@ def test_segments_that_are_not_measured_are_not_drawn(half_minute: wp.Recording)
     assert not {"left_upper_arm", "right_forearm"} & set(links)
 
 
-# In the browser -----------------------------------------------------------------------------------------------------
-
 in_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome")
 
 
