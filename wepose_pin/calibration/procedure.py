@@ -143,7 +143,7 @@ def calibrate(
     check_method(method)
     is_stated = protocol is not None
     if not isinstance(protocol, Protocol):
-        protocol = load_protocol(protocol or choose_protocol(recording.phases, formulation))
+        protocol = load_protocol(choose_protocol(recording.phases, formulation) if protocol is None else protocol)
     if not isinstance(model, BodyModel):
         model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
     _check_inputs(recording, protocol, model, measured or {})

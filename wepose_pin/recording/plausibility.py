@@ -137,7 +137,7 @@ def _check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> 
         return float(np.mean(np.maximum(0.0, 1.0 - np.abs(means / STANDARD_GRAVITY - 1.0))))
 
     stated = average_coherence(np.eye(3))
-    if stated >= STIFF:  # coherence is at most 1: above it no other unit is better
+    if not stated < STIFF:  # coherence is at most 1: above it no other unit is better; NaN: beyond any range
         return []
     coherences = {name: average_coherence(change) for name, change in GYRO_CHANGES.items()}
     best = max(coherences.values())
