@@ -8,8 +8,9 @@ start phase, then of each accepted static phase. Rotation about horizontal axes 
 (1) to (4) compare samples with the noise of samples, which grows with the rate of sampling. At 1 kHz the start of a
 smooth motion hides in it for 0.13 s in the paper's dynamic experiment, and a filter takes that motion for bias. At
 25 Hz the covariance of a window's dozen samples scatters beyond the limit. So (1) and (2), but for the published
-method, allow the slow motion that they would allow at `WHITE_RATE_HZ`, whatever the rate. Condition (6), ours, compares
-the mean gyro of the window's newest part with that of the window. The noise of these means does not depend on the rate.
+method, allow no more slow motion than they would at `WHITE_RATE_HZ`, and at low rates the scatter. Condition (6), ours,
+compares the mean gyro of the window's newest part with that of the window. The noise of these means does not depend on
+the rate.
 """
 
 from __future__ import annotations
@@ -88,8 +89,9 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
     if newest < n and 0.0 < squared_bound < np.inf:
         change_cov = noise.gyro_cov * (1.0 / newest - 1.0 / n) + half_second_cov
         rate_change = np.linalg.inv(change_cov) / squared_bound
-    # Beyond white noise (1) and (2) allow what they would with that of `WHITE_RATE_HZ`, and twice its own scatter
-    white_share = max(WHITE_RATE_HZ / rate_hz, 4.0 * np.sqrt(3.0 / n)) if np.isfinite(test.rate_stds) else 1.0
+    # Beyond white noise (1) and (2) allow what they would with that of `WHITE_RATE_HZ` at most, and twice its scatter
+    white_share = max(min(1.0, WHITE_RATE_HZ / rate_hz), 4.0 * np.sqrt(3.0 / n))
+    white_share = white_share if np.isfinite(test.rate_stds) else 1.0
     limits = []
     for factor, cov, white_var in (
         (test.alpha, noise.gyro_cov, np.trace(noise.bias_step_cov) / 6.0),
