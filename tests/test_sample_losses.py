@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from wepose_pin import NOISE_FREE, ImuSensor, Recording, Simulation, WeposeError, calibrate, simulate, simulate_person
+from wepose_pin import (
+    NOISE_FREE,
+    ImuSensor,
+    Recording,
+    Simulation,
+    WeposeError,
+    calibrate,
+    simulate,
+    simulate_person,
+    track,
+)
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +67,18 @@ def test_a_loss_of_some_samples_changes_little(simulation: Simulation) -> None:
     whole, short = calibrate(simulation.recording()), calibrate(lossy(simulation, (11.0, 11.08)))
     assert short.subject.lengths == pytest.approx(whole.subject.lengths, abs=2e-3)
     assert "samples-not-connected" not in [each.code for each in short.diagnostics]
+
+
+@pytest.mark.parametrize("options", [{}, {"causal": True}, {"method": "smekf"}, {"method": "smoother"}])
+def test_nothing_is_known_of_a_segment_while_its_sensor_is_lost(
+    simulation: Simulation, options: dict[str, Any]
+) -> None:
+    """Its ± is that of an angle which may be any, and no hand is further off than an arm allows."""
+    recording = lossy(simulation, (5.0, 15.0))
+    begin = recording.phases["clasp"][0][0]
+    pose = track(recording, **options).pose
+    during = (pose.time > begin + 7.0) & (pose.time < begin + 14.5)
+    std = np.sqrt(np.linalg.eigvalsh(pose.segment_cov["left_upper_arm"][during]))
+    assert std == pytest.approx(np.pi / np.sqrt(3.0), rel=0.05)
+    arm = sum(length for name, length in simulation.lengths.items() if name.startswith("left_"))
+    assert np.sqrt(np.trace(pose.point_cov["left_palm"][during], axis1=1, axis2=2)).max() < 2.0 * arm

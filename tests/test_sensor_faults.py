@@ -164,6 +164,8 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
         table.with_columns(pl.col(rates).degrees()).write_parquet(path / "recording.parquet")
     read = load_session(path)
     assert read.sensors[BROKEN].gyro_range == pytest.approx(level, rel=0.03)
+    arrays = Recording.from_arrays(RATE, torso=(np.clip(fast, -level, level), accel))
+    assert arrays.imus["torso"].gyro_range == pytest.approx(level, rel=0.03)
     (saturated,) = (each for each in read.diagnostics if each.code == "signal-saturated")
     assert (saturated.place, saturated.facts["variant"]) == (BROKEN, "gyro")
     assert saturated.facts["range"] == pytest.approx(level)

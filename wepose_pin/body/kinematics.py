@@ -28,6 +28,9 @@ LARGEST_IN_TABLE = 1e6  # of a position, also in mm, or a standard deviation; mo
 # Columns of a quaternion, a position and a covariance in a table.
 _QUAT, _XYZ = ("qx", "qy", "qz", "qw"), ("x", "y", "z")
 _ENTRIES = {f"cov_{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
+# [rad²] about each axis with which a vector v is off by 2 |v|, which is the most; about one axis alone by √2 |v|, as a
+# vector whose direction about it may be any.
+_MOST_VARIANCE = 2.0
 _DETERMINED = 1e-9  # [m/rad or rad/rad] by which open motions may move what is determined: rounding
 _OPEN = 1e-3  # share of an open motion from which a joint counts as undetermined
 _SINGULAR = 1e-6  # singular value of a Jacobian, below which a motion is open
@@ -356,6 +359,7 @@ def compute_point_covariances(
     heading_cov : two segments → (n,) [rad²], the covariance of their headings; a pair left out: independent
     """
     points, heading_cov = find_known_points(model, quat_WL), heading_cov or {}
+    segment_cov = {name: _limit_variance(cov) for name, cov in segment_cov.items()}
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return {}
@@ -406,6 +410,17 @@ def compute_point_covariances(
                 cov += outer + outer.swapaxes(1, 2)
         covariances[point] = cov + off_law
     return covariances
+
+
+def _limit_variance(cov: np.ndarray) -> np.ndarray:
+    """Limit covariances (n, 3, 3) [rad²] to `_MOST_VARIANCE` about each axis."""
+    wide = np.trace(cov, axis1=1, axis2=2) > _MOST_VARIANCE
+    if not wide.any():
+        return cov
+    values, vectors = np.linalg.eigh(cov[wide])
+    limited = cov.copy()
+    limited[wide] = (vectors * np.minimum(values, _MOST_VARIANCE)[:, None, :]) @ vectors.swapaxes(1, 2)
+    return limited
 
 
 def _propagate_through_joints(

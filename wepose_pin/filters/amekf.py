@@ -65,6 +65,7 @@ BLOCK = np.dtype(
         ("R_rate", float, (3, 3, 3)),  # Σ R_VS ω_c dt [rad], for the axes c = x, y, z of S
         ("R_moving", float, (3, 3)),  # Σ R_VS dt [s] over the samples that are not static
         ("length", float),  # [s]
+        ("accel_s", float),  # [s] of that in which accel was measured
         ("lost_rotation_var", float),  # [rad²] of the rotation lost in the block
         ("measurements", np.int64),  # number n of measurements; the next four have n rows
         ("state_index", np.int64, MAX_MEASUREMENTS),  # of the measured state
@@ -100,7 +101,7 @@ class AmekfParams(base.FilterParams):
     motion_bias_walk: NonNegative = 5e-5  # [rad/s/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg
     accel_bias_walk: NonNegative = 1e-4  # [m/s²/√s]
-    gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it a rotation is as uncertain as a lost one
+    gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
     lost_force_std: NonNegative = 5.0  # [m/s²] of the unknown acceleration while accel is lost (NaN)
 
 
@@ -109,7 +110,8 @@ def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def
     """Fill `out` (7, m) with the rows of ``F P`` of θ, velocity and position, which differ from those of `P` (25, m).
 
     θ⁺ = θ − Σ R dt b − Σ R ω dt M − Σ_moving R dt d, v⁺ = v + ∫ θ × g e_z − Σ R dt f, p⁺ = p + ∫ v, the integrals by
-    the trapezoid; b, d, f are the errors of bias, bias in motion and accelerometer bias.
+    the trapezoid, of θ × g e_z while accel is measured; b, d, f are the errors of bias, bias in motion and
+    accelerometer bias.
     """
     columns = P.shape[1]
     bias, moving = P[ERROR.gyro_bias], P[ERROR.motion_bias]
@@ -124,7 +126,7 @@ def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def
             x, y, z = block.R_rate[0, i, c], block.R_rate[1, i, c], block.R_rate[2, i, c]
             for j in range(columns):
                 out[i, j] -= x * matrix[3 * c, j] + y * matrix[3 * c + 1, j] + z * matrix[3 * c + 2, j]
-    g, t = 0.5 * block.length * gravity, 0.5 * block.length
+    g, t = 0.5 * block.accel_s * gravity, 0.5 * block.length
     for i in range(2):
         sign, other = (g, 1) if i == 0 else (-g, 0)
         v, p = VELOCITY + i, POSITION + i
@@ -151,13 +153,13 @@ def _propagate(state, model):  # type: ignore[no-untyped-def]
             P[i, j] = 0.5 * (corner[i, j] + corner[j, i])
 
     dt = model.dt
-    attitude_var = block.lost_rotation_var + model.rate_noise_psd * state.rate_squared * dt
+    attitude_var = model.rate_noise_psd * state.rate_squared * dt
     velocity_var = model.force_error_var * (state.acceleration_sum * dt) ** 2
     velocity_var += (state.impact_excess * dt) ** 2 + model.lost_accel_var * state.lost_accel_s**2
     for i in range(STATES):
         P[i, i] += model.noise_psd[i] * block.length
     for i in range(3):
-        P[i, i] += attitude_var
+        P[i, i] = base.add_lost(P[i, i] + attitude_var, block.lost_rotation_var)
     P[VELOCITY, VELOCITY] += velocity_var
     P[VELOCITY + 1, VELOCITY + 1] += velocity_var
 
@@ -214,6 +216,7 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     """Propagate P over the block, correct by the bounds of motion or by the static phase, and begin the next block."""
     x, P, block, R = state.x, state.P, state.block, state.R_VS
     block.length, block.lost_rotation_var, block.measurements = state.samples * model.dt, state.lost_rotation_var, 0
+    block.accel_s = block.length - state.lost_accel_s
     for j in range(STATES):
         block.correction[j] = 0.0
     _propagate(state, model)

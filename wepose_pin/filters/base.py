@@ -21,10 +21,11 @@ START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so 
 
 # While the gyroscope is lost (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant
 # HOLD_S. While it is lost or saturated, the attitude's standard deviation grows by the motion that may have been
-# missed: after T seconds by LOST_RATE_STD T²/(T + HOLD_S), up to MOST_LOST_STD.
+# missed: after T seconds by s T²/(T + HOLD_S) with s = LOST_RATE_STD or, where it is saturated, the range: what is cut
+# off may be as much as what is measured. No axis is less certain than by MOST_LOST_STD.
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
-MOST_LOST_STD = 4.0  # [rad] beyond which nothing is known
+MOST_LOST_STD = np.pi / np.sqrt(3.0)  # [rad] of an angle of which nothing is known
 
 # Columns of `Orientation.about_vertical`
 HEADING, RATE, RATE_VAR = range(3)
@@ -147,12 +148,19 @@ def bridge_rate(state, model, gx, gy, gz, bx, by, bz):  # type: ignore[no-untype
         state.lost_s = 0.0
     else:
         before, after = state.lost_s, state.lost_s + model.dt
+        rate_std = model.gyro_range if is_measured else LOST_RATE_STD
         lost_var = (
-            min(MOST_LOST_STD, LOST_RATE_STD * after * after / (after + HOLD_S)) ** 2
-            - min(MOST_LOST_STD, LOST_RATE_STD * before * before / (before + HOLD_S)) ** 2
+            min(MOST_LOST_STD, rate_std * after * after / (after + HOLD_S)) ** 2
+            - min(MOST_LOST_STD, rate_std * before * before / (before + HOLD_S)) ** 2
         )
         state.lost_s = after
     return x, y, z, is_measured, lost_var
+
+
+@inlined
+def add_lost(variance, lost_var):  # type: ignore[no-untyped-def]
+    """Return the variance [rad²] of an axis with that of what was missed, up to `MOST_LOST_STD`."""
+    return variance + max(0.0, min(lost_var, MOST_LOST_STD**2 - variance))
 
 
 @inlined

@@ -85,13 +85,13 @@ def _scale(s, u):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _predict(A, C, B, R, model, lost_var):  # type: ignore[no-untyped-def]
+def _predict(A, C, B, R, model):  # type: ignore[no-untyped-def]
     """Algorithm 1, prediction: P ← F P Fᵀ + Q with F = [[I, −δt R_VS], [0, I]]."""
     F = _scale(-model.dt, R[0]) + _scale(-model.dt, R[1]) + _scale(-model.dt, R[2])
     A = _add_product(A, F, _transpose(C))
     C = _add_product(C, F, B)
     A = _add_product(A, C, _transpose(F))
-    return _symmetric(A, model.attitude_var + lost_var), C, _symmetric(B, model.bias_var)
+    return _symmetric(A, model.attitude_var), C, _symmetric(B, model.bias_var)
 
 
 @inlined
@@ -140,7 +140,10 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         wx, wy, wz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
         rotate_by_vector(quat, wx * dt, wy * dt, wz * dt)
         fill_matrix(quat, R)
-        A, C, B = _predict(A, C, B, R, model, lost_var)
+        A, C, B = _predict(A, C, B, R, model)
+        if lost_var > 0.0:
+            x, y, z = base.add_lost(A[0], lost_var), base.add_lost(A[4], lost_var), base.add_lost(A[8], lost_var)
+            A = x, A[1], A[2], A[3], y, A[5], A[6], A[7], z
         if static[k] and is_measured and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
             A, C, B = _correct(A, C, B, state, model, gx, gy, gz, ax, ay, az)
         # A scale of the gyroscope that is wrong by s gives the heading an error of s times the rotation about the

@@ -18,7 +18,7 @@ from ..compilation import compiled
 from ..rotations import fill_matrix, rotate_by_world_vector
 from . import amekf
 from .amekf import BLOCK, PROPAGATED_STATES, SMOOTHED_STATES, STATES
-from .base import HEADING, RATE, RATE_VAR, OrientationFilter, into_sensor
+from .base import HEADING, MOST_LOST_STD, RATE, RATE_VAR, OrientationFilter, into_sensor
 
 COUNT = len(SMOOTHED_STATES)
 
@@ -36,6 +36,10 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
         rows[:] = start_rows
         if k > 0:
             rows[:] = blocks[k - 1].P_smoothed_rows
+        if min(rows[0, 0], rows[1, 1]) > 0.5 * MOST_LOST_STD**2:  # what follows tells nothing of an attitude so lost
+            lam[:3] = 0.0
+            Lam[:3] = 0.0
+            Lam[:, :3] = 0.0
         deviation[k] = -np.dot(rows, lam)
         for n in range(COUNT):
             cov[:, n] = rows[:, SMOOTHED_STATES[n]]

@@ -19,7 +19,7 @@ from ..arguments import EACH_TIME, Positive, check_array, check_fields, check_na
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, WrongUnit, one_of
-from .faults import check_arrays
+from .faults import check_arrays, find_gyro_range
 from .intervals import Intervals as Intervals
 from .intervals import check_phases as check_phases
 from .intervals import check_time as check_time
@@ -187,6 +187,9 @@ class Recording:
             count = count or len(np.atleast_1d(values[0] if isinstance(values, tuple) else values))
         recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check(units=False)
         check_arrays(f"{name}: sensors.", rate_hz, {each: (s.gyro_S, s.accel_S) for each, s in recording.imus.items()})
+        for each, imu in recording.imus.items():
+            built[each] = replace(imu, gyro_range=find_gyro_range(imu.gyro_S, imu.accel_S))
+        recording = replace(recording, sensors=built)
         try:
             return replace(recording, diagnostics=recording.check_signals())
         except WrongUnit as error:

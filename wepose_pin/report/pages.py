@@ -64,6 +64,9 @@ def write_track_pages(
 def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
     """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
     after_start, table = find_samples_after_start(tracked), tracked.model.table
+    lost = np.logical_or.reduce([np.zeros(len(after_start), dtype=bool), *tracked.pose.gap.values()])
+    lost_share, known = lost[after_start].mean(), after_start & ~lost
+    after_start = known if known.any() else after_start
     stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
     for joint, each in angles.joints.items() if angles is not None else ():
         for k, angle in enumerate(each.names):
@@ -84,7 +87,8 @@ def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
     if not good and tracked.pose.segment_cov:  # of a mechanism
         variances = [np.median(np.diagonal(cov[after_start], 0, 1, 2), 0) for cov in tracked.pose.segment_cov.values()]
         good = [f"the orientation of each link to ± {np.degrees(np.sqrt(np.max(variances))):.1f}°"]
-    sentences = [f"**Good for** {listed(good)}."] if good else []
+    unless = f" while no sensor is lost, as one is for {100.0 * lost_share:.0f} % of the time" if lost_share else ""
+    sentences = [f"**Good for** {listed(good)}{unless}."] if good else []
     sentences += [f"Least certain: {worst}, ± {stds[worst]:.0f}°."] if worst not in (best, None) else []
     sentences += [explain_no_covariance(tracked)] if not (good and tracked.recording.imus) else []
     return " ".join(sentences)

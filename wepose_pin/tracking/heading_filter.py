@@ -242,7 +242,8 @@ class HeadingFilter:
         # Recent misfit e of each joint's accelerations, with its force f: sums of e fᵀ (9), e² (3) and f² (3) [m²/s⁴]
         # over samples, in which older ones count less, and how many count.
         self._misfits = np.zeros((len(self.pairs), 16))
-        self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
+        # Whether a sensor has lost a sample in the last knot, and whether its tilt is lost since a loss.
+        self._lost_before, self._tilt_lost = np.zeros((2, k), dtype=bool)
         # Of a heading that is searched: its log-likelihood around the circle, whose zero is the estimate less `_turned`
         # [rad], and the sensor to which it is relative, a step nearer to the one that is best known.
         self._log_likelihood, self._turned = np.zeros((k, len(CIRCLE))), np.zeros(k)
@@ -285,12 +286,14 @@ class HeadingFilter:
         lost : (k,) bool: the sensor has lost a sample
         filters : (5, k) at the end
         """
+        leapt = filters[4] - self._last[4] > SEARCH_TILT_STD**2  # false for NaN
+        self._tilt_lost = (lost | leapt | self._tilt_lost) & (filters[4] > SEARCH_TILT_STD**2)
+        lost = lost | self._tilt_lost
         self.process, leaps = self._find_process(filters, lost, quat_WL)
         self.predict(self.process)
         unreliable, lost_now = lost | self._lost_before, lost  # after a loss the tilt may be wrong
         order = self._find_searched(leaps)
-        tilted, lost = unreliable | (filters[4] > SEARCH_TILT_STD**2), lost | self._searched
-        unreliable = unreliable | self._searched
+        tilted, unreliable, lost = unreliable, unreliable | self._searched, lost | self._searched
         palms = self.palms if clasped.any() else None
         if palms is not None and unreliable[[self.names.index(name) for name in palms.segments]].any():
             palms = None
@@ -327,7 +330,7 @@ class HeadingFilter:
         least = self._drift_psd * self.knot_s
         gained = np.maximum(gained_var, MIN_DRIFT_PSD * self.knot_s)
         known = np.isfinite(gained)
-        leaps = lost | (gained > LEAP_RATIO * np.maximum(self._recent_growth, least))
+        leaps = gained > np.where(lost, least, LEAP_RATIO * np.maximum(self._recent_growth, least))
         remembered = self._recent_growth * np.exp(-self.knot_s / GROWTH_MEMORY_S)
         self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
         change, variance = np.zeros(len(self.x)), self._process_var.copy()

@@ -52,7 +52,7 @@ def compute_segment_covariance(
     filtered: tuple[np.ndarray, np.ndarray],
     heading_offset: np.ndarray,
     variance: np.ndarray,
-    lost: np.ndarray | None = None,
+    lost: np.ndarray,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left, without soft tissue.
 
@@ -104,8 +104,7 @@ def compute_segment_covariance(
     known, at_knot, correction = variance.T
     # The filter alone may know the heading better; to it a correction is an error of that size.
     corrected = np.minimum(known + np.maximum(with_heading_V[:, 2] - at_knot, 0.0), alone + correction)
-    if lost is not None:
-        corrected = np.where(lost, np.maximum(corrected, alone), corrected)
+    corrected = np.where(lost, np.maximum(corrected, alone), corrected)
     with_heading_W = Rotation.from_quat(quat_WV).apply(with_heading_V)
     removed = (1.0 - np.sqrt(corrected / alone))[:, None] * with_heading_W
     cov_W[:, 2, :2] -= removed[:, :2]

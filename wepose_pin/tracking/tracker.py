@@ -34,11 +34,12 @@ from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import BEST, OFFLINE, Orientation, SensorFilters, average_start, check_method, collect_orientations
-from ..filters.base import HEADING, HOLD_S, LOST_RATE_STD
+from ..filters.base import HEADING, HOLD_S, LOST_RATE_STD, MOST_LOST_STD
 from ..filters.phases import BEGINNING_S, find_reference_phases
 from ..filters.static import StaticTest
 from ..recording import ImuSensor, Recording, Sensor, join_recordings
 from ..recording.arrivals import unpack_orientations
+from ..recording.clocks import LONGEST_GAP_S
 from ..rotations import product
 from .heading_filter import CLASP, HeadingFilter
 from .headings import E_Z, HeadingCorrection, HeadingCorrector
@@ -56,7 +57,7 @@ SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 # What the filters of a chunk state, and of its n samples and k segments: `quat_VS` (n, k, 4) and the attitude's
 # covariance as in `Tracker._stack`, `quat_WL` (n, k, 4), ψ (n, k) [rad], `HeadingCorrector.variance` (n, 3, k), and
-# the time (n, k) [s] since a measured orientation.
+# the time (n, k) [s] since a sample that was measured.
 _Placed = tuple[Mapping[str, Orientation], tuple[np.ndarray, ...]]
 
 
@@ -204,7 +205,7 @@ class Tracker:
         self.names, self._rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         k = len(self.names)
         self._measured = np.array([name not in first.imus for name in self.names])
-        self._lost = np.zeros(k, dtype=int)  # samples since a measured orientation
+        self._lost = np.zeros(k, dtype=int)  # samples since one that was measured
         self._quat_LS = np.array([mounts[name].as_quat() for name in self.names])
         # (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
         self._heading_offset = np.array([offsets[name] for name in self.names])
@@ -271,7 +272,7 @@ class Tracker:
         self._end_s, self._clasped = float(chunk.time[-1]), bool(clasped[-1])
         lost, samples = np.zeros((n, len(self.names)), dtype=int), np.arange(n)
         for i, sensor in enumerate(chunk.sensors.values()):
-            if self._measured[i] and sensor.gap is not None:
+            if sensor.gap is not None:
                 lost[:, i] = samples - np.maximum.accumulate(np.where(sensor.gap, -1 - self._lost[i], samples))
         self._lost = lost[-1]
         return orientation, (quat_VS, attitude_cov, quat_WL, offset, variance, lost / self._rate_hz)
@@ -306,15 +307,15 @@ class Tracker:
                 quat_VS[:, i] = np.concatenate([before[None], sensor.quat_VS])[last][1:]
         return quat_VS, attitude_cov, about_vertical
 
-    def _find_covariance(self, i: int, placed: tuple[np.ndarray, ...], lost: np.ndarray | None) -> np.ndarray | None:
+    def _find_covariance(self, i: int, placed: tuple[np.ndarray, ...]) -> np.ndarray | None:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment in W, error on the left; None: there is none.
 
-        `placed` is that of `_place`, `lost` as in `compute_segment_covariance`.
+        `placed` is that of `_place`.
         """
         name, (quat_VS, attitude_cov, _, offset, variance, lost_s) = self.names[i], (own[:, i] for own in placed)
         if self._measured[i]:
             # It grows by the motion that may have been missed, as that of the filters.
-            missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
+            missed_std = np.minimum(MOST_LOST_STD, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
             attitude_cov = (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
         if np.isnan(attitude_cov[0, 0, 0]):
             return None
@@ -323,6 +324,7 @@ class Tracker:
         if self._first.sensors[name].aligned:
             return np.asarray(attitude_cov + soft)
         mounting, R_LS = (self._first, name, self._subject, self._start_pose), Rotation.from_quat(self._quat_LS[i])
+        lost = lost_s > LONGEST_GAP_S
         return compute_segment_covariance(mounting, R_LS, (quat_VS, attitude_cov), offset, variance, lost) + soft
 
     def _solve_pose(self, chunk: Recording, placed: _Placed, correction: HeadingCorrection | None) -> TrackResult:
@@ -340,8 +342,8 @@ class Tracker:
             variance[:, self._measured] = np.nan
             quat_WL = rotations.multiply(rotations.rotation_about(E_Z, delta), quat_WL)
             values = *values[:2], quat_WL, values[3], variance, values[5]
-        for i, (name, sensor) in enumerate(chunk.sensors.items()):
-            cov = self._find_covariance(i, values, sensor.gap if is_smoothed else None)
+        for i, name in enumerate(self.names):
+            cov = self._find_covariance(i, values)
             if cov is not None:
                 covariances[name] = cov
         segments = SegmentOrientations(
@@ -374,11 +376,10 @@ class Tracker:
         Of a sensor with measured orientations they hold what `pack_orientations` gives. The orientations are without
         the correction by soft tissue and by the body's joints.
         """
-        quat_VS = np.empty(self.quat_WL.shape)
+        quat_VS, lost = np.empty(self.quat_WL.shape), ~np.isfinite(gyro_S).all(axis=1)
+        self._lost = np.where(lost, self._lost + 1, 0)
         if self._measured.any():
             measured = unpack_orientations(gyro_S, accel_S)
-            lost = ~np.isfinite(measured).all(axis=1)
-            self._lost = np.where(lost & self._measured, self._lost + 1, 0)
             quat_VS[:] = np.where(lost[:, None], self._recent[-1], measured)
             if not self._measured.all():
                 quat_VS[~self._measured] = self._filters.step(gyro_S[~self._measured], accel_S[~self._measured])
@@ -397,7 +398,7 @@ class Tracker:
         """Compute the covariance (3, 3) [rad²] of the i-th segment in W after the last step; NaN: there is none."""
         quat_VS, attitude_cov, _ = self._read_filters()
         now = self.quat_WL, self._heading_offset, np.transpose(self._variance), self._lost / self._rate_hz
-        covariance = self._find_covariance(i, (quat_VS, attitude_cov, *(values[None] for values in now)), None)
+        covariance = self._find_covariance(i, (quat_VS, attitude_cov, *(values[None] for values in now)))
         return np.full((3, 3), np.nan) if covariance is None else covariance[0]
 
     def mark_phase(self, phase: str, *, begins: bool) -> None:
