@@ -54,9 +54,6 @@ def motion(n: int) -> dict[str, np.ndarray]:
     return values
 
 
-# Headers ----------------------------------------------------------------------------------------------------------
-
-
 def test_mot_keeps_the_rules(result: Path, tmp_path: Path) -> None:
     export(result, tmp_path / "x.mot")
     text = (tmp_path / "x.mot").read_text(encoding="utf-8")
@@ -153,9 +150,6 @@ def test_an_ordinary_arm_is_no_warning_and_one_with_a_wrong_heading_is(tmp_path:
         assert {each.code for each in exported.diagnostics} == codes
 
 
-# The set-ups of OpenSim's tools -----------------------------------------------------------------------------------
-
-
 def test_the_scale_tool_is_told_the_subjects_lengths(result: Path, tmp_path: Path) -> None:
     assert not export(result, tmp_path / "anna.xml", "scale").diagnostics
     tool = ElementTree.parse(tmp_path / "anna.xml").getroot()[0]
@@ -180,9 +174,6 @@ def test_the_setups_of_opensense_name_each_other(result: Path, tmp_path: Path) -
     assert ik.findtext("orientations_file") == "a.sto"
     begin, end = map(float, (ik.findtext("time_range") or "").split())
     assert (begin, end) == pytest.approx((1.995, 5.005))
-
-
-# OpenSim itself ---------------------------------------------------------------------------------------------------
 
 
 def pose_by_opensim(peer: Callable[..., Any], values: Mapping[str, np.ndarray], noise: float = 0.0) -> Pose:

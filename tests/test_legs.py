@@ -31,9 +31,6 @@ def made(activity: str) -> Simulation:
     )
 
 
-# Activities -------------------------------------------------------------------------------------------------------
-
-
 def test_the_true_pose_has_the_angles_of_the_activity(activity: str, made: Simulation) -> None:
     angles = joint_angles(made.truth())
     most = {name: np.degrees(angle.values.max(axis=0)) for name, angle in angles.joints.items()}
@@ -85,8 +82,6 @@ def test_an_activity_that_is_none_or_too_short_is_named() -> None:
     with pytest.raises(WeposeError, match="seconds 5: sitting down and standing up once takes 8"):
         simulate_activity("sit", seed=1, seconds=5.0)
 
-
-# The commands -----------------------------------------------------------------------------------------------------
 
 SHORT = ("--seconds", "15")
 LEG_JOINTS = [f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle")]

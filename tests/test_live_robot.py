@@ -246,9 +246,6 @@ def test_braking_from_any_moment_keeps_the_limits(arm: retargeting.Robot) -> Non
     keeps_its_limits(run.messages(), arm)
 
 
-# The output ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def robot_out() -> Iterator[Callable[..., RobotOutput]]:
     """Makes one, and ends its thread whatever becomes of the test."""
@@ -372,9 +369,6 @@ def test_the_example_reads_it_and_notices_the_end(robot_out, arm: retargeting.Ro
     assert run.returncode == 0
     assert re.match(r"\d+ hold \[", lines[0])
     assert lines[-1] == "no command: the robot is to be stopped here; waiting"
-
-
-# The command line ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,6 @@ def session(folder: Path, file: str | Path, segments: tuple[str, ...], data: str
     return folder / "session.toml"
 
 
-# The real export ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def xsens(data: Path) -> tuple[Path, dict[str, np.ndarray], dict[str, np.ndarray]]:
     """The file, Xsens's own joint positions in the identity pose (3,) and over time (n, 3), by segment."""
@@ -120,9 +117,6 @@ def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
     torso, arm = (Rotation.from_quat(recording.sensors[name].quat_VS) for name in ("torso", "left_forearm"))
     ours = Rotation.from_quat(pose.quat_WL["torso"]).inv() * Rotation.from_quat(pose.quat_WL["left_forearm"])
     assert (ours.inv() * torso.inv() * arm).magnitude().max() < 1e-9
-
-
-# Made files --------------------------------------------------------------------------------------------------------
 
 
 def made(folder: Path, path: Path, segments: tuple[str, ...]) -> wp.Recording:

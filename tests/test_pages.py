@@ -56,9 +56,6 @@ def fails(*_: Any, **__: Any) -> Any:
     raise ValueError("cannot convert\nfloat NaN to integer")
 
 
-# The causes -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("options", [[], ["--causal"]])
 def test_an_arm_that_hangs_throughout_is_tracked(
     session: Path, tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
@@ -78,9 +75,6 @@ def test_a_report_of_nothing_that_moves(sensors: str, seconds: float, noise: flo
     folder = wp.track(recorded({}, seconds=seconds, noise=noise, sensors=sensors)).save(tmp_path / "out")
     assert names(folder) == RESULT | {"view.html", "report.html"}
     assert "nan" not in text_of((folder / "report.html").read_text(encoding="utf-8"))
-
-
-# What fails all the same ----------------------------------------------------------------------------------------------
 
 
 def test_a_page_that_fails_is_a_warning(

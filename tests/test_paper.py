@@ -56,9 +56,6 @@ def gap_by_length(made: tuple[Person, Simulation, Recording], time: np.ndarray) 
     return R["torso"].apply([0.0, 1.0, 0.0]).reshape(-1), np.stack(columns, axis=2).reshape(-1, 4)
 
 
-# Calibration ----------------------------------------------------------------------------------------------------------
-
-
 def test_lengths_are_those_of_numpys_least_squares(
     made: tuple[Person, Simulation, Recording], estimated: Calibration
 ) -> None:
@@ -161,9 +158,6 @@ def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> N
             measured={"shoulder_width": 0.38},
             formulation="paper",
         )
-
-
-# Commands -------------------------------------------------------------------------------------------------------------
 
 
 def test_the_commands(

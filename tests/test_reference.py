@@ -229,9 +229,6 @@ def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
         register(pose, Pose(time, leaning, {}))
 
 
-# The command ------------------------------------------------------------------------------------------------------
-
-
 def run_evaluate(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
     ended = run("evaluate", *argv)
     out, err = capsys.readouterr()
@@ -302,8 +299,6 @@ def test_a_table_of_markers_of_ones_own(brief: Pose, tmp_path: Path) -> None:
         with pytest.raises(WeposeError, match=says):
             read_reference(path, tmp_path / "m.toml")
 
-
-# Files that are wrong -----------------------------------------------------------------------------------------------
 
 SPOILED_TRC = {
     "no TRC": (("PathFileType", "Path"), "does not begin with PathFileType"),

@@ -60,9 +60,6 @@ def the(code: str, result: wp.TrackResult) -> wp.Diagnostic:
     return one
 
 
-# What the page says ---------------------------------------------------------------------------------------------------
-
-
 def test_it_opens_offline_with_its_sections_and_five_figures_each_with_a_caption(page: str) -> None:
     assert headings(page) == SECTIONS
     pairs = captions(page)
@@ -106,9 +103,6 @@ def test_a_known_person_and_nothing_to_say(result: wp.TrackResult, page: str) ->
     text = text_of(report(replace(result, subject=replace(result.subject, name="anna", note=""))))
     assert "No warnings." in text
     assert "wepose calibrate" not in text
-
-
-# What is missing, and what it warns of --------------------------------------------------------------------------------
 
 
 def test_without_a_covariance_it_says_so(recording: wp.Recording) -> None:
@@ -186,9 +180,6 @@ def test_elbows_that_cannot_be(forward_deg: float, aside_deg: float, is_bad: int
     hinges = [each for each in elbow(forward_deg, aside_deg).diagnostics if each.code.startswith("hinge-")]
     assert [(each.code, each.place) for each in hinges] == [("hinge-implausible", "left_elbow")] * is_bad
     assert all(np.degrees(each.value or 0.0) > 29.0 for each in hinges)
-
-
-# The command and the browser ------------------------------------------------------------------------------------------
 
 
 def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

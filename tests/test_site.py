@@ -122,8 +122,6 @@ def test_python_of_pages_imports_what_is_there() -> None:
                 assert all(hasattr(import_module(module), name.strip()) for name in names.split(",")), body
 
 
-# The commands run ----------------------------------------------------------------------------------------------------
-
 GENERIC = DATA / "osim" / "Rajagopal_2015.osim"  # OpenSim's model, which the pages ask the reader to have
 STAND_S, CLASP = "[[0.5, 4.5]]", "[[7.6, 32.0]]"
 
@@ -258,9 +256,6 @@ def test_the_live_session_of_python_runs(workplace: Path, tmp_path: Path) -> Non
     assert done.returncode == 0, done.stdout
     assert "'right_palm': array" in done.stdout
     assert (tmp_path / "morning.mcap").is_file()
-
-
-# Packages ------------------------------------------------------------------------------------------------------------
 
 
 def lower_bounds(lines: list[str], separator: str) -> dict[str, Version]:

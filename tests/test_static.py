@@ -73,9 +73,6 @@ def test_a_blow_says_no_for_one_window_and_is_forgotten() -> None:
     assert without[300:590].mean() > 0.9
 
 
-# (5), which the paper does not have --------------------------------------------------------------------------------
-
-
 def chair(rate_deg_s: float, seed: int = 0, sway_deg_s: float = 0.0) -> tuple[np.ndarray, np.ndarray, Rotation]:
     """Gyro, accel and orientations of a sensor on a chair: 5 s still, 12 s at a steady rate about the vertical, 3 s
     still; all the while it sways about the vertical at three frequencies."""
@@ -154,9 +151,6 @@ def test_the_start_of_a_smooth_motion_is_not_static(rate_hz: float) -> None:
             late.append(sensor.time[np.flatnonzero(static)[-1]] - sensor.moving[0])
     assert np.mean(ends[StaticTest()]) < 0.1  # [s]
     assert np.mean(ends[PaperTest()]) > (0.12 if rate_hz > 500.0 else 0.0)
-
-
-# The static phase ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seconds", [0.6, 1.0, 1.9, 2.5, 4.0, 10.0])
