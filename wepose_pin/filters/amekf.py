@@ -71,7 +71,7 @@ BLOCK = np.dtype(
         ("state_index", np.int64, MAX_MEASUREMENTS),  # of the measured state
         ("inv_innovation_std", float, MAX_MEASUREMENTS),  # 1/√s, s the innovation's variance
         ("normalized_innovation", float, MAX_MEASUREMENTS),  # innovation/√s
-        ("normalized_gain", float, (MAX_MEASUREMENTS, COLUMNS)),  # P h/√s
+        ("normalized_gain", float, (MAX_MEASUREMENTS, STATES)),  # P h/√s
         ("correction", float, STATES),  # of the states
         ("P_smoothed_rows", float, (len(SMOOTHED_STATES), STATES)),  # rows `SMOOTHED_STATES` of P after the block
     ],
@@ -143,10 +143,14 @@ def _propagate(state, model):  # type: ignore[no-untyped-def]
     """Propagate over the block that ends: P ← F P Fᵀ + Q."""
     P, rows, columns, corner, block = state.P, state.FP_rows, state.FP_columns, state.FPF_corner, state.block
     fill_transition_rows(block, model.gravity, P, rows)
+    for i in range(PROPAGATED_STATES):
+        for j in range(PROPAGATED_STATES, STATES):
+            P[i, j] = rows[i, j]
+            P[j, i] = rows[i, j]
     # The corner of (F P) Fᵀ is the transpose of F (F P)ᵀ: the same product, with the rows as columns.
     for i in range(PROPAGATED_STATES):
         for j in range(STATES):
-            columns[j, i] = P[i, j] = P[j, i] = rows[i, j]
+            columns[j, i] = rows[i, j]
     fill_transition_rows(block, model.gravity, columns, corner)
     for i in range(PROPAGATED_STATES):
         for j in range(PROPAGATED_STATES):
@@ -165,19 +169,38 @@ def _propagate(state, model):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _correct(state, at, value, variance):  # type: ignore[no-untyped-def]
-    """Correct by a measured value of the state `at`: P ← P − P h hᵀ P/s. The correction of the states is summed up."""
-    P, block = state.P, state.block
-    row, inv_std = block.measurements, 1.0 / np.sqrt(P[at, at] + variance)
-    gain, innovation = block.normalized_gain[row], (value - state.x[at] - block.correction[at]) * inv_std
-    for j in range(COLUMNS):
-        gain[j] = P[at, j] * inv_std
-    for i in range(STATES):
-        block.correction[i] += gain[i] * innovation
+def _correct(state, at, axes, variance):  # type: ignore[no-untyped-def]
+    """Correct by `state.measured` of two or three states from `at` on: P ← P − P h hᵀ P/s for one after the other.
+
+    The correction of the states is summed up. The gains come first, so that P is gone through once.
+    """
+    P, block, gains = state.P, state.block, state.gains
+    for m in range(3):
+        gain, measured_state, row = gains[m], at + m, block.measurements
+        if m == axes:
+            for j in range(COLUMNS):
+                gain[j] = 0.0
+            break
         for j in range(COLUMNS):
-            P[i, j] -= gain[i] * gain[j]
-    block.state_index[row], block.inv_innovation_std[row], block.normalized_innovation[row] = at, inv_std, innovation
-    block.measurements += 1
+            gain[j] = P[measured_state, j]
+        for before in range(m):
+            share = gains[before, measured_state]
+            for j in range(COLUMNS):
+                gain[j] -= share * gains[before, j]
+        inv_std = 1.0 / np.sqrt(gain[measured_state] + variance)
+        innovation = (state.measured[m] - state.x[measured_state] - block.correction[measured_state]) * inv_std
+        for j in range(COLUMNS):
+            gain[j] *= inv_std
+        for j in range(STATES):
+            block.correction[j] += gain[j] * innovation
+            block.normalized_gain[row, j] = gain[j]
+        block.state_index[row], block.inv_innovation_std[row] = measured_state, inv_std
+        block.normalized_innovation[row] = innovation
+        block.measurements += 1
+    for i in range(STATES):
+        first, second, third = gains[0, i], gains[1, i], gains[2, i]
+        for j in range(COLUMNS):
+            P[i, j] -= first * gains[0, j] + second * gains[1, j] + third * gains[2, j]
 
 
 @inlined
@@ -189,9 +212,9 @@ def _correct_to_zero(state, at, variance):  # type: ignore[no-untyped-def]
     P, x, correction = state.P, state.x, state.block.correction
     y0, y1 = x[at] + correction[at], x[at + 1] + correction[at + 1]
     expected = 0.5 * (P[at, at] + P[at + 1, at + 1])
-    variance = max(variance, (y0 * y0 + y1 * y1) / OUTLIER_CHI2_2 - expected)
-    for i in range(2):
-        _correct(state, at + i, 0.0, variance)
+    for i in range(3):
+        state.measured[i] = 0.0
+    _correct(state, at, 2, max(variance, (y0 * y0 + y1 * y1) / OUTLIER_CHI2_2 - expected))
 
 
 @inlined
@@ -200,15 +223,15 @@ def _correct_bias(state, variance):  # type: ignore[no-untyped-def]
     P, at, y = state.P, GYRO_BIAS, state.innovation
     size, expected = 0.0, variance
     for i in range(3):
-        y[i] = state.gyro_sum[i] / state.samples - state.x[at + i] - state.block.correction[at + i]
+        state.measured[i] = state.gyro_sum[i] / state.samples
+        y[i] = state.measured[i] - state.x[at + i] - state.block.correction[at + i]
         size += y[i] * y[i]
         expected += P[at + i, at + i] / 3.0
     if size > OUTLIER_CHI2_3 * expected:
         for i in range(3):
             for j in range(3):
                 P[at + i, at + j] += y[i] * y[j]
-    for i in range(3):
-        _correct(state, at + i, state.gyro_sum[i] / state.samples, variance)
+    _correct(state, at, 3, variance)
 
 
 @inlined
@@ -355,6 +378,8 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
         FP_rows=np.zeros((PROPAGATED_STATES, COLUMNS)),
         FP_columns=np.zeros((STATES, 8)),  # the last column is zero
         FPF_corner=np.zeros((PROPAGATED_STATES, 8)),
+        gains=np.zeros((3, COLUMNS)),  # P h/√s of the measurements that are taken together
+        measured=np.zeros(3),
         innovation=np.zeros(3),
     )
     block_samples = max(1, round(p.block_s * rate_hz))

@@ -50,7 +50,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
             break
         block = blocks[k - 1]
         for n in range(block.measurements - 1, -1, -1):  # λ and Λ before a measurement from those after it
-            at, root, gain = block.state_index[n], block.inv_innovation_std[n], block.normalized_gain[n, :STATES].copy()
+            at, root, gain = block.state_index[n], block.inv_innovation_std[n], block.normalized_gain[n].copy()
             u = root * np.dot(Lam, gain)
             lam[at] -= root * (np.dot(gain, lam) + block.normalized_innovation[n])
             Lam[at] -= u
