@@ -149,6 +149,7 @@ def test_gaps(recording: wp.Recording) -> None:
     page = report(wp.track(changed(recording, "torso", gap=gap)))
     assert any("4.00 s" in row for row in rows(page) if row[0] == "torso")
     assert "Lines break where samples are lost" in text_of(page)
+    assert re.search(r"Good for [^.]* while no sensor is lost \(one is for 1\d% of the time\)\.", text_of(page))
 
 
 def test_a_large_bias(recording: wp.Recording) -> None:

@@ -244,9 +244,8 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
-        cov_W[:, 2, 2] -= (
-            2.0 * pose.find_heading_cov(*members)[known]
-        )  # a common heading error does not rotate the joint
+        # A common heading error does not rotate the joint.
+        cov_W[:, 2, 2] -= 2.0 * pose.find_heading_cov(*members)[known]
         rows = _gradients(values, joint.sequence, quat_WP, left)
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = _expand(known, np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN))

@@ -73,14 +73,14 @@ def analyze_movement(
     if repetitions is not None and phases.get(repetitions):
         marked = inside[repetitions]
         reason = "" if marked else f"no interval of the phase {repetitions} lies in the selected time"
-        found = Repetitions(np.array(marked, dtype=float).reshape(-1, 2), repetitions, reason=reason)
+        occurrences = Repetitions(np.array(marked, dtype=float).reshape(-1, 2), repetitions, reason=reason)
     elif repetitions in (None, *(places := list_angles(angles))):
-        found = find_repetitions(angles, repetitions, rising)
+        occurrences = find_repetitions(angles, repetitions, rising)
     else:
         choices = one_of((*phases, *places), repetitions, 30)
         raise WrongOption("repetitions", repetitions, f"no such phase of the recording, and no such angle; {choices}")
-    curves = compute_mean_curves(angles, found.spans) if len(found.spans) else {}
-    return Movement(name, pose, angles, inside, found, curves, cutoff_hz)
+    curves = compute_mean_curves(angles, occurrences.spans) if len(occurrences.spans) else {}
+    return Movement(name, pose, angles, inside, occurrences, curves, cutoff_hz)
 
 
 def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
@@ -179,9 +179,8 @@ def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np
     """Standard deviations (m,) [rad] of the k-th angle at the second sample of each pair (m, 2) less the first."""
     rows = compute_gradients(pose, name, joint, pairs.ravel())[:, k].reshape(-1, 2, 1, 3)
     variances = np.zeros((2, len(pairs)))  # constant in W, in L
-    shared = pose.find_heading_cov(JOINTS[name].proximal, JOINTS[name].distal)[
-        pairs
-    ]  # a common error does not rotate the joint
+    # A common heading error does not rotate the joint.
+    shared = pose.find_heading_cov(JOINTS[name].proximal, JOINTS[name].distal)[pairs]
     for segment in (JOINTS[name].proximal, JOINTS[name].distal):
         if segment == "world" or not len(pairs):
             continue

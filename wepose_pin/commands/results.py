@@ -38,7 +38,7 @@ def view(
     Parameters
     ----------
     result
-        Folder that `wepose track` or, of a robot, `wepose retarget` wrote.
+        Folder written by `wepose track`, or by `wepose retarget` for a robot.
     out
         Write the page to this file. Without it view.html in RESULT is used, and written if it is missing.
     open
@@ -328,7 +328,7 @@ def export(
     Parameters
     ----------
     result
-        Folder that `wepose track` or, of a robot, `wepose retarget` wrote.
+        Folder written by `wepose track`, or by `wepose retarget` for a robot.
     further
         Only for lerobot: further results, which become episodes of the same data set.
     out

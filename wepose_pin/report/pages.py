@@ -87,7 +87,7 @@ def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
     if not good and tracked.pose.segment_cov:  # of a mechanism
         variances = [np.median(np.diagonal(cov[after_start], 0, 1, 2), 0) for cov in tracked.pose.segment_cov.values()]
         good = [f"the orientation of each link to ± {np.degrees(np.sqrt(np.max(variances))):.1f}°"]
-    unless = f" while no sensor is lost, as one is for {100.0 * lost_share:.0f} % of the time" if lost_share else ""
+    unless = f" while no sensor is lost (one is for {lost_share:.0%} of the time)" if lost_share >= 0.005 else ""
     sentences = [f"**Good for** {listed(good)}{unless}."] if good else []
     sentences += [f"Least certain: {worst}, ± {stds[worst]:.0f}°."] if worst not in (best, None) else []
     sentences += [explain_no_covariance(tracked)] if not (good and tracked.recording.imus) else []
