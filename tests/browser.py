@@ -68,6 +68,8 @@ class Browser:
             one, self._rest = self._rest.split(b"\0", 1)
             answer = json.loads(one)
             if answer.get("id") == self._number:
+                if "navigated" in answer.get("error", {}).get("message", ""):  # the page loads anew: it gives nothing
+                    return {"result": {}}
                 assert "error" not in answer, answer
                 return answer["result"]
             self._note(answer)
