@@ -6,11 +6,11 @@ import importlib
 import importlib.util
 import re
 import sys
+from html import escape, unescape
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
-from xml.sax.saxutils import escape, unescape
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -86,7 +86,7 @@ def resolve_meshes(urdf: Path) -> str:
 
     def resolve(match: re.Match[str]) -> str:
         mesh = find_mesh(unescape(match[2]), urdf)
-        return match[0] if mesh is None else f"{match[1]}{escape(str(mesh), {chr(34): '&quot;'})}{match[3]}"
+        return match[0] if mesh is None else f"{match[1]}{escape(str(mesh))}{match[3]}"
 
     text = urdf.read_text(encoding="utf-8", errors="replace")
     return re.sub(r'(<mesh\b[^>]*?\bfilename\s*=\s*["\'])(.*?)(["\'])', resolve, text)

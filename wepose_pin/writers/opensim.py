@@ -15,10 +15,10 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 import polars as pl
