@@ -57,6 +57,11 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
     segment_cov = {name: c[None] for name, c in cov.items()}
     point_cov = compute_point_covariances(model, still, segment_cov, shape_cov, heading_cov=heading_cov)
     assert set(point_cov) == set(points)
+    # After hours of drift the headings are all but unknown, each and in common.
+    drifted = {name: c + np.diag([0.0, 0.0, 1e6 * c[0, 2, 2]]) for name, c in segment_cov.items()}
+    together = {pair: 1e6 * shared for pair, shared in heading_cov.items()}
+    for c in compute_point_covariances(model, still, drifted, shape_cov, heading_cov=together).values():
+        assert (np.linalg.eigvalsh(c) >= 0.0).all()
 
     common, drawn = rng.normal(size=n), {}
     for name in names:

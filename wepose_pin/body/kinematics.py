@@ -358,8 +358,11 @@ def compute_point_covariances(
     q : (n, nq) of a mechanism; without it its points have none
     heading_cov : two segments → (n,) [rad²], the covariance of their headings; a pair left out: independent
     """
-    points, heading_cov = find_known_points(model, quat_WL), heading_cov or {}
-    segment_cov = {name: _limit_variance(cov) for name, cov in segment_cov.items()}
+    points, stated = find_known_points(model, quat_WL), segment_cov
+    segment_cov = {name: _limit_variance(cov) for name, cov in stated.items()}
+    least = np.finfo(float).tiny
+    kept = {name: np.sqrt(cov[:, 2, 2] / np.maximum(stated[name][:, 2, 2], least)) for name, cov in segment_cov.items()}
+    heading_cov = {(a, b): kept[a] * kept[b] * shared for (a, b), shared in (heading_cov or {}).items()}
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return {}
