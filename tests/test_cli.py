@@ -60,7 +60,7 @@ def test_a_command_and_its_function_share_their_options(name: str, capsys: pytes
     """Each has one default and one description; the method of `wepose track` may be that of a live session."""
     function, command = inspect.signature(getattr(wp, name)).parameters, options(name)
     shared = {option for option in command if option in function} - {"out"}
-    assert shared >= {"track": {"method", "limits"}, "export": {"names"}, "retarget": {"scale"}}.get(name, set())
+    assert shared >= {"track": {"method", "causal"}, "export": {"names"}, "retarget": {"scale"}}.get(name, set())
     for option in shared - ({"method"} if name == "track" else set()):
         assert command[option].default == function[option].default, option
     assert run(name, "--help") == 0

@@ -177,14 +177,13 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
     assert "rad/s while gravity does not turn: deg/s? State the unit" in said[1]
 
 
-def test_takes_and_marks_are_phases_and_texts_of_the_recording(
+def test_takes_are_phases_of_the_recording(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live.LiveLoop, "STATUS_PERIOD_S", 2e-2)
     file = tmp_path / "a.mcap"
     take, phase = Request("take"), Request("phase", "clasp")
-    asked = [(9.0, take), (12.0, Request("text", "trial 3")), (15.0, take), (16.0, phase), (18.0, phase), (20.0, take)]
-    asked += [(21.0, Request("mark")), (22.0, Request("nonsense"))]
+    asked = [(9.0, take), (15.0, take), (16.0, phase), (18.0, phase), (20.0, take), (22.0, Request("nonsense"))]
     watcher = Watcher(asked)
     run(recording, file, one_by_one(recording), watcher)
     log = read_live_log(file)
@@ -193,7 +192,6 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(
     for name, spans in {"take_1": [(9.0, 15.0)], "clasp": [(16.0, 18.0)], "take_2": [(20.0, last)]}.items():
         np.testing.assert_allclose(phases[name], spans, atol=0.15)
     assert_is_tracked_so(log, track(log.recording, causal=True))  # with the clasp that was marked
-    assert [(round(mark.time), mark.text) for mark in log.recording.marks] == [(12, "trial 3"), (21, "mark")]
     assert [action.name for action in watcher.statuses[0].actions] == ["reset"]
     labels = {(action.label, action.is_on) for status in watcher.statuses for action in status.actions}
     assert {("Begin take", False), ("End take 1", True), ("End clasp", True), ("End take 2", True)} <= labels

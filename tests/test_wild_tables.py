@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -67,15 +66,6 @@ def epoch_ns(path: Path) -> None:
     path.write_text("\t".join(["timestamp", *names]) + "\n" + "\t".join(units) + "\n" + lines(time, columns, "\t"))
 
 
-def dates(path: Path) -> None:
-    """Dates in place of times, and what a robot's messages call their fields."""
-    fields = ("linear_acceleration", "angular_velocity")
-    names = [f"/{s}/imu/{field}.{a}" for s in ("torso", "left_forearm") for field in fields for a in "xyz"]
-    time = [f"2026-03-12 08:00:{0.01 * k:09.6f}" for k in range(N)]
-    table = np.column_stack([values(k) for k in range(2)])
-    path.write_text(",".join(["stamp", *names]).replace("stamp", "timestamp") + "\n" + lines(time, table, ","))
-
-
 @pytest.mark.parametrize(
     ("write", "start", "fact"),
     [
@@ -83,7 +73,6 @@ def dates(path: Path) -> None:
         (windows, 0.0, "'Zeit (ms)' is in ms, as its name says: 100 Hz"),
         (epoch_ms, EPOCH, "'unix_timestamp' is in ms, as it grows by 10 from row to row: 100 Hz"),
         (epoch_ns, EPOCH, "'timestamp' is in ns, as its name says: 100 Hz"),
-        (dates, 0.0, "'timestamp' holds dates; by the first and the last of them: 100 Hz"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -111,19 +100,6 @@ def test_a_table_of_a_spreadsheet_may_be_a_text(name: str, capsys: pytest.Captur
     assert f"{name}: CSV table, 7 columns" in info(capsys, tmp_path / name, "--write")
     recording = wp.load_session(tmp_path / "session.toml")
     np.testing.assert_allclose(recording.sensors["torso"].gyro_S, GYRO, atol=0.006)
-
-
-@pytest.mark.parametrize(("name", "form"), [("Uhrzeit", "%H:%M:%S.%f"), ("datetime", "%Y-%m-%dT%H:%M:%S.%fZ")])
-def test_the_rate_follows_from_times_of_day_and_dates(
-    name: str, form: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    names = ["date", name, *(f"chest {k} {a}" for k in ("acc", "gyr") for a in "xyz")]
-    begin = datetime(2026, 3, 12, 8, 0, 59)
-    time = [f"2026-03-12,{(begin + timedelta(milliseconds=20 * k)).strftime(form)}" for k in range(N)]
-    (tmp_path / "a.csv").write_text(",".join(names) + "\n" + lines(time, values(0), ","))
-    text = info(capsys, tmp_path / "a.csv", "--write")
-    assert f"'{name}' holds dates; by the first and the last of them: 50 Hz" in text
-    assert wp.load_session(tmp_path / "session.toml").rate_hz == 50.0
 
 
 def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -91,10 +91,10 @@ def lines(diagnostics: Iterable[Diagnostic], titled: bool = False) -> list[tuple
     return [(severity, join_text(text, titled)) for severity, text in render_all(diagnostics)]
 
 
-def notebook_html(value: object, diagnostics: Iterable[Diagnostic] = (), tables: Iterable[str] = ()) -> str:
-    """Return what a notebook shows of an object: its one line, tables as HTML, and diagnostics in words."""
+def notebook_html(value: object, diagnostics: Iterable[Diagnostic]) -> str:
+    """Return what a notebook shows of an object: its one line, and diagnostics in words."""
     entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(diagnostics))
-    return f"<p>{escape(repr(value))}</p>{''.join(tables)}" + (f"<ul>{entries}</ul>" if entries else "")
+    return f"<p>{escape(repr(value))}</p>" + (f"<ul>{entries}</ul>" if entries else "")
 
 
 def gravest_first(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:

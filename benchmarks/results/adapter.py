@@ -220,7 +220,7 @@ def track(
     model: Path | None = None,
     options: Iterable[str] = (),
 ) -> list[str]:
-    """`options`: of causal, gaps, covariance, torques, no-limits."""
+    """`options`: of causal, gaps, covariance, torques."""
     argv = ["track", str(session), "-o", str(out), "--method", method, "--no-report"]
     argv += ["--subject", str(subject), "--accept-failed"] if subject else []
     argv += ["--model", str(model)] if model else []

@@ -150,15 +150,12 @@ def _methods(recording: str, exported_methods: Iterable[str] = ()) -> list[Task]
 
 
 def _model(places: Places) -> Arrays:
-    """A body of 48 degrees of freedom, with torques, with and without its limits."""
+    """A body of 48 degrees of freedom, with torques."""
     urdf = places.real("human_urdf", "humanSubject01_48dof.urdf")
     session = places.session("mild")
-    found: Arrays = {}
-    for name, options in (("limits", ("torques",)), ("no_limits", ("no-limits",))):
-        result = places.work / name
-        found |= tracked(session, result, f"48dof/{name}", method="amekf", model=urdf, options=options)
-        found |= exported(result, places.work / f"{name}_exports", f"48dof/{name}")
-    return found
+    result, name = places.work / "limits", "48dof/limits"
+    found = tracked(session, result, name, method="amekf", model=urdf, options=("torques",))
+    return found | exported(result, places.work / "limits_exports", name)
 
 
 def _chain(places: Places) -> Arrays:

@@ -174,7 +174,7 @@ def track(session: Path, out: Path, method: str, options: Iterable[str], subject
     options = set(options)
     argv = ["track", str(session), "-o", str(out), *_gaps(options)]
     argv += [] if method == "amekf" else ["--method", method]
-    argv += [f"--{name}" for name in ("covariance", "causal", "torques", "no-limits") if name in options]
+    argv += [f"--{name}" for name in ("covariance", "causal", "torques") if name in options]
     argv += [] if "report" in options else ["--no-report"]
     return argv + (["--subject", str(subject)] if subject else [])
 

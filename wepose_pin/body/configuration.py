@@ -32,13 +32,12 @@ _DAMPING, _MOST_DAMPING = 1e-7, 1e6  # the least; the greatest ends a search tha
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> np.ndarray:
+def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
     """Solve for `q` (n, nq) with the measured orientations, segment → (n, 4) xyzw, or the nearest configuration.
 
-    An unmeasured segment is rigid with the one above; `limits`: keep those of joints with one axis.
+    An unmeasured segment is rigid with the one above. The limits of joints with one axis are kept.
     """
-    solver = KinematicsSolver(model, quat_WL, limits=limits)
-    return solver.solve(np.stack(list(quat_WL.values()), axis=1))
+    return KinematicsSolver(model, quat_WL).solve(np.stack(list(quat_WL.values()), axis=1))
 
 
 def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
@@ -52,7 +51,7 @@ class KinematicsSolver:
 
     Parameters
     ----------
-    segments, limits : the measured ones, in the order in which orientations come; as of `solve_configuration`
+    segments : the measured ones, in the order in which orientations come
     start : (nq,) the configuration of a mechanism before the first frame; None: all joints at zero
 
     Attributes
@@ -61,20 +60,18 @@ class KinematicsSolver:
     data : Pinocchio's data of the last pose of `compute_points`
     """
 
-    def __init__(
-        self, model: BodyModel, segments: Collection[str], *, limits: bool = True, start: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, model: BodyModel, segments: Collection[str], *, start: np.ndarray | None = None) -> None:
         if not segments:
             raise BadData("no segment has an orientation: a pose needs one")
         check_segments(model.table, segments, f"{model.pin.name}: ", BadModel)
         m, is_mechanism = model.pin, model.table.is_mechanism
-        self._model, self.segments, self._limits, self._neutral = model, tuple(segments), limits, pin.neutral(m)
+        self._model, self.segments, self._neutral = model, tuple(segments), pin.neutral(m)
         self._last: np.ndarray | None = None  # (nq,) of the frame before
         fitted = _find_fitted(model, segments)
         joints = sorted({joint for name in fitted for joint in model.chains[name]})
         if is_mechanism:
             self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
-        self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
+        self._fit = _Fit(model, fitted, self.segments, joints) if fitted else None
         exact = [name for name in self.segments if not is_mechanism and model.find_spherical(name) is not None]
         relations = [_relate(model, name, self.segments) for name in exact]
         self._bent = [relation for relation in relations if len(relation[3]) > 1]
@@ -103,7 +100,7 @@ class KinematicsSolver:
         if self._spherical:
             _set_relative_rotations(quat_WL, *self._spherical, last, q)
         for relation in self._bent:
-            _bend(self._model.pin, q, quat_WL, relation, last, limits=self._limits)
+            _bend(self._model.pin, q, quat_WL, relation, last)
         if self._fit is not None:
             self._fit.run(q, quat_WL, self._last)
         for girdle, at in self._girdles:
@@ -179,9 +176,7 @@ def _relate(model: BodyModel, segment: str, segments: Sequence[str]) -> _Relatio
     return segments.index(segment), -1 if above is None else segments.index(above), R_AL, R_AJ, places
 
 
-def _bend(
-    m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation, last: np.ndarray, *, limits: bool
-) -> None:
+def _bend(m: pin.Model, q: np.ndarray, quat_WL: np.ndarray, relation: _Relation, last: np.ndarray) -> None:
     """Write the joints' values into `q` (n, nq): an equal share of the tilt in each place, the rest in the last."""
     row, above, R_AL, R_AJ, places = relation
     R_WA, up = quat_WL[:, above] if above >= 0 else _IDENTITY, R_AL.apply([0.0, 0.0, 1.0])
@@ -199,8 +194,7 @@ def _bend(
             q[:, at : at + 4] = unwrap_signs(quat, last[at : at + 4])
         else:
             axis = R.apply(m.joints[joint].extract().axis)
-            ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else (-np.inf, np.inf)
-            q[:, at] = np.clip(share @ axis, *ends)
+            q[:, at] = np.clip(share @ axis, m.lowerPositionLimit[at], m.upperPositionLimit[at])
             rotation = rotation_about(axis, q[:, at])
         left = multiply(conjugate(rotation), left)
 
@@ -240,9 +234,7 @@ class _Fit:
     links, joints : the fitted ones of the measured `segments`; those that may move
     """
 
-    def __init__(
-        self, body: BodyModel, links: Sequence[str], segments: Sequence[str], joints: Sequence[int], limits: bool
-    ) -> None:
+    def __init__(self, body: BodyModel, links: Sequence[str], segments: Sequence[str], joints: Sequence[int]) -> None:
         m = body.pin
         self._rows = [segments.index(link) for link in links]
         self._model, self._data = m, m.createData()
@@ -258,7 +250,7 @@ class _Fit:
         self._both = self._pull @ self._pull.T  # (f, f): how many links two columns both turn
         begin = [j for j in joints if body.table.is_mechanism or m.nqs[j] == 1]  # where they were in the frame before
         self._places = np.array([m.idx_qs[j] + k for j in begin for k in range(m.nqs[j])], dtype=int)
-        bounded = [j for j in joints if m.nqs[j] == 1] if limits else []
+        bounded = [j for j in joints if m.nqs[j] == 1]
         self._at = np.array([m.idx_qs[joint] for joint in bounded], dtype=int)
         self._lower, self._upper = m.lowerPositionLimit[self._at], m.upperPositionLimit[self._at]
         self._bounded = np.searchsorted(self._columns, find_columns(m, bounded))

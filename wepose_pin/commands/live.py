@@ -78,7 +78,7 @@ def live(
         With --guide: write subject, recordings and the sensors' setup to this folder. Without it, a new folder is
         named by the date.
     record
-        Record all samples and poses in this file. Keys mark takes and moments in it. `wepose track FILE` gives the same
+        Record all samples and poses in this file. Keys mark takes and phases in it. `wepose track FILE` gives the same
         poses again.
     robot
         Send joint commands with which this robot follows the person: a robot as in `wepose retarget --robot`, or a TOML

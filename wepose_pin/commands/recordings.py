@@ -178,7 +178,6 @@ def track(
     torques: Annotated[bool, opt.MORE] = False,
     causal: Annotated[bool, opt.RESEARCH] = False,
     open_loop: Annotated[bool, opt.RESEARCH] = False,
-    limits: Annotated[bool, opt.RESEARCH] = True,
 ) -> Mapping[str, Any]:  # as in summary.json
     """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
 
@@ -236,7 +235,7 @@ def track(
                 person = parse_subject(log.header["subject"], session)
         else:
             recording = load_session(session, gaps=gaps)
-        tracker = Tracker(person, model=model, method=chosen, causal=causal, open_loop=open_loop, limits=limits)
+        tracker = Tracker(person, model=model, method=chosen, causal=causal, open_loop=open_loop)
         chunks = track_chunks(
             tracker,
             recording,

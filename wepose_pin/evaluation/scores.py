@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ from ..angles import euler, joint_angles
 from ..arguments import check_arguments
 from ..body import BodyTable, load_table
 from ..body.kinematics import Pose
-from ..diagnostics import notebook_html
 from ..errors import BadData, BadOption
 from ..recording import format_span
 from ..tracking import TrackResult
@@ -98,12 +96,6 @@ class Evaluation:
             f"Evaluation({self.samples} samples; largest rms error of a segment {total:.1f}°, of a point "
             f"{position:.0f} mm)"
         )
-
-    def _repr_html_(self) -> str:
-        errors = {name: f"{error.total_rmse:.2f}°" for name, error in self.attitude.items()}
-        errors |= {f"{name} (point)": f"{error.rmse:.0f} mm" for name, error in self.position.items()}
-        rows = "".join(f"<tr><td>{escape(name)}</td><td>{error} rms</td></tr>" for name, error in errors.items())
-        return notebook_html(self, tables=[f"<table>{rows}</table>"])
 
 
 def evaluate(

@@ -46,8 +46,6 @@ SHOWN_LATENCIES = 1000  # and in the status
 RESET = Action("reset", "Reset headings", "r")
 BEGIN_TAKE = Action("take", "Begin take", "t")
 BEGIN_PHASE = Action("phase", "Begin phase", "p", "name of the phase (clasp)")
-MARK = Action("mark", "Mark", "m")
-MARK_TEXT = Action("text", "Mark with text", "n", "text of the mark")
 
 
 class SessionSummary(NamedTuple):
@@ -210,11 +208,11 @@ class LiveLoop(Stage):
             return ()
         if not self._is_tracking or self.log.path is None:
             return (RESET,)
-        marks = [BEGIN_TAKE, BEGIN_PHASE]
-        for k, action in enumerate(marks):
+        actions = [RESET, BEGIN_TAKE, BEGIN_PHASE]
+        for k, action in enumerate(actions):
             if name := self._open_phases.get(action.name):
-                marks[k] = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
-        return (RESET, *marks, MARK, MARK_TEXT)
+                actions[k] = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
+        return tuple(actions)
 
     def do(self, action: Action, text: str) -> None:
         text, time_s = text[:LONGEST_TEXT], self._stream.newest
@@ -228,15 +226,13 @@ class LiveLoop(Stage):
             phase = self._open_phases.pop(action.name)
             self.log.event("end", phase=phase, time=time_s)
             self._tracker.mark_phase(phase, begins=False)
-        elif action.name in (BEGIN_TAKE.name, BEGIN_PHASE.name):
+        else:
             self._takes += action.name == BEGIN_TAKE.name
             phase = f"take_{self._takes}" if action.name == BEGIN_TAKE.name else text or "clasp"
             self._open_phases[action.name] = phase
             # It begins with the next tick: the ticks before have been tracked without it.
             self.log.event("begin", phase=phase, time=time_s + 1.0 / self._stream.clock.rate_hz)
             self._tracker.mark_phase(phase, begins=True)
-        else:
-            self.log.event("mark", text=text or "mark", time=time_s)
 
     # The state -------------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ each message with the text ``taken`` when it is drawn; until then no other comes
 - Binary: time (float64, NaN before the start); for each link its rotation row by row and its position [m] (12 float32);
   the points whose paths are drawn (3 float32 each); for each link whether its sensor is lost (1 byte). The names of the
   links are in the page; those of a robot come last.
-- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"action": "text", "text": "box"}``.
+- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"action": "phase", "text": "box"}``.
 """
 
 from __future__ import annotations

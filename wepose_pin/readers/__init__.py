@@ -19,7 +19,7 @@ from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import Finite, Key, TomlTable, format_value, is_number, read_record, read_toml, toml_key
-from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printable
+from ..errors import BadData, BadSession, MissingFile, one_of, printable
 from ..recording import CONFIGURATION, ImuSensor, OrientationSensor, Recording, Sensor, clocks, compute_mount, read_axes
 from ..recording.clocks import TIME_UNITS, Clock
 from ..recording.faults import Fault, check_sensors
@@ -121,18 +121,12 @@ def _find_model(path: Path, top: TomlTable) -> str:
 
 
 def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
-    if "still" in keys:  # of an earlier version
-        needed = "write static = [[from, to]], seconds in which the sensors lie on a table"
-        raise BadSession(f"{keys.at('still')} is called static now: {needed}")
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
         pairs: list[Any] = value if isinstance(value, list) else [None]
         if not all(isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) for pair in pairs):
             raise BadSession(f"{keys.at(name)} = {value!r} is not a list of intervals; write [[from, to]] in seconds")
         phases[name] = tuple((float(a), float(b)) for a, b in pairs)
-        for first, last in phases[name]:
-            if not first < last:
-                raise BadPhase(f"{keys.at(name)}: [{first:g}, {last:g}] is empty; the earlier time comes first")
     return phases
 
 

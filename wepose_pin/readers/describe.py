@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 
 from ..body import BodyTable, load_table
 from ..data_tables import FORMATS as TABLES
@@ -343,10 +342,7 @@ def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) ->
             break
     else:
         lines = () if arrays else read_first_lines(about.path)
-        if dated := next(filter(None, (_measure_dated_rate(table[name]) for name in guess.times)), None):
-            data["rate_hz"], name = dated
-            about.facts.append(f"'{name}' holds dates; by the first and the last of them: {dated[0]:g} Hz")
-        elif stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
+        if stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
             data["rate_hz"] = float(stated["rate"])
             about.facts.append(f"no column looks like time; the file says '{stated[0]}'")
         else:
@@ -363,17 +359,6 @@ def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) ->
         data["time_unit"] = unit
         if unit != named:
             about.checks["time_unit"] = reason
-
-
-def _measure_dated_rate(column: pl.Series) -> tuple[float, str] | None:
-    """Measure the rate [Hz] of a column of dates or times of day, with its name; None: it holds neither."""
-    texts = column.cast(pl.String).str.strip_chars()
-    for kind, form, tick_s in ((pl.Datetime("us"), None, 1e-6), (pl.Time, "%T%.f", 1e-9)):
-        with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
-            ticks = texts.str.strptime(kind, form, strict=False).cast(pl.Int64).drop_nulls().to_numpy()
-            if len(ticks) and (span := float(np.ptp(ticks)) * tick_s):
-                return float(f"{(len(ticks) - 1) / span:.6g}"), column.name
-    return None
 
 
 # Text of the session ---------------------------------------------------------------------------------------------

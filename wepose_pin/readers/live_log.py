@@ -5,8 +5,7 @@ file is in chunks, so that what was written before a session was killed is reada
 
 docs/live.md lists the topics. Events are ``clock`` when ticks began, ``start`` (``begin``, ``end``: ticks) the start
 pose of tracking, ``reset`` (``tick``) headings anew before that tick; and what was marked, in seconds: ``begin`` and
-``end`` of a phase (``phase``, ``time``), ``discard`` what was marked of it so far, ``mark`` a text (``text``,
-``time``).
+``end`` of a phase (``phase``, ``time``), ``discard`` what was marked of it so far.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData
 from ..libraries import check_file, library_errors
-from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor
+from ..recording import ImuSensor, Intervals, OrientationSensor, Recording, Sensor
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
 from ..recording.clocks import bridge
 from .device import Device, DeviceSensor
@@ -38,10 +37,9 @@ KIND = "a recording of wepose live"
 
 
 class Markers:
-    """Phases and texts that were marked in a live session."""
+    """Phases that were marked in a live session."""
 
     def __init__(self) -> None:
-        self.texts: list[Mark] = []
         self._spans: dict[str, list[tuple[float, float]]] = {}
         self._open: dict[str, float] = {}
 
@@ -54,8 +52,6 @@ class Markers:
         elif kind == "discard":
             self._spans.pop(event["phase"], None)
             self._open.pop(event["phase"], None)
-        elif kind == "mark":
-            self.texts.append(Mark(event["time"], event["text"]))
 
     def phases(self, first: float, last: float) -> dict[str, Intervals]:
         """Name → intervals [s] of each phase, cut to `first` and `last` [s]; one that was not ended ends there."""
@@ -70,7 +66,7 @@ class Markers:
 class LiveRecording(NamedTuple):
     """The contents of a live session's recording."""
 
-    recording: Recording  # on its ticks, with its start pose, marked phases and texts, and resets
+    recording: Recording  # on its ticks, with its start pose, marked phases, and resets
     header: dict[str, Any]  # the settings before the first sample
     first: int  # tick of the first pose
     quat_WL: np.ndarray  # (n, k, 4) xyzw, the live poses, in the order of the header's sensors
@@ -120,7 +116,7 @@ def read_live_log(path: Path) -> LiveRecording:
         ticks_of_resets = (int(event["tick"]) for event in events if event["kind"] == "reset")
         resets = tuple(tick for tick in ticks_of_resets if tick < synchronizer.next_tick)
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, resets)
-    recording = replace(recording.check(units=False), marks=tuple(markers.texts))
+    recording = recording.check(units=False)
     if not is_complete:
         recording = replace(recording, diagnostics=(Diagnostic("file-incomplete", WARNING, path.name),))
     first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0

@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import EACH_TIME, Positive, check_array, check_fields, check_names, check_value
-from ..diagnostics import Diagnostic, notebook_html
+from ..diagnostics import Diagnostic
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, WrongUnit, one_of
 from .faults import check_arrays, find_gyro_range
@@ -69,13 +69,6 @@ RATE_ERROR = 0.01  # allowed relative error of the stated rate; it is the relati
 LONGEST_STEP = 2.5  # allowed step between two times, in steps of the rate; readers resample uneven clocks
 
 
-class Mark(NamedTuple):
-    """A text that was marked at a time."""
-
-    time: float  # [s]
-    text: str
-
-
 @dataclass(frozen=True)
 class Recording:
     """Sensors on one uniform time base.
@@ -94,7 +87,6 @@ class Recording:
     source : the file of the recording, for messages
     truth : a file with reference poses; None: there is none
     resets : numbers of the samples before which a live session reset the headings, with the person in the start pose
-    marks : texts that were marked in a live session, with their times [s]
     joints : joint → value [rad or m] in the start pose "configuration"; joints that are not named are at zero
     model : the body that wears the sensors: the file of a table or a URDF, or the name of a body of the package;
         empty: the upper body
@@ -112,7 +104,6 @@ class Recording:
     source: Path | None = None
     truth: Path | None = None
     resets: tuple[int, ...] = ()
-    marks: tuple[Mark, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
     model: str = ""
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -125,9 +116,6 @@ class Recording:
         seconds = float(self.time[-1] - self.time[0])
         about = f"{seconds:.1f} s at {self.rate_hz:g} Hz, {len(self.sensors)} sensors"
         return f"Recording({self.name!r}: {about}{phases})"
-
-    def _repr_html_(self) -> str:
-        return notebook_html(self, self.diagnostics)
 
     @classmethod
     def from_arrays(
@@ -271,7 +259,7 @@ class Recording:
         return samples if gap is None else samples[~gap[span]]
 
     def cut(self, span: slice) -> Recording:
-        """Return the recording of a span of samples; `phases` and `marks` are not cut."""
+        """Return the recording of a span of samples; `phases` are not cut."""
         first, last, _ = span.indices(len(self))
         span = slice(first, last)
         sensors = {name: sensor.part(span) for name, sensor in self.sensors.items()}

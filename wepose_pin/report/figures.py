@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..documents import whole_folder
-from ..errors import UnknownKey, one_of
+from ..errors import Named
 from ..recording import find_runs
 from .words import plain
 
@@ -114,11 +114,11 @@ class ReportFigure(Figure):
         return self.svg()
 
 
-class Figures(dict[str, ReportFigure]):
+class Figures(Named[ReportFigure]):
     """matplotlib figures by name, which can be changed before they are saved; a notebook shows all of them."""
 
-    def __missing__(self, name: str) -> ReportFigure:
-        raise UnknownKey(f"no figure '{name}'; {one_of(self, name)}")
+    def __init__(self) -> None:
+        super().__init__("figure", {})
 
     def __repr__(self) -> str:
         return f"Figures({', '.join(self)})"

@@ -38,7 +38,6 @@ def track(
     static_test: StaticTest | None = None,
     open_loop: bool = False,
     causal: bool = False,
-    limits: bool = True,
     accept_failed: bool = False,
 ) -> TrackResult:
     """Estimate the pose of a body from a recording.
@@ -66,8 +65,6 @@ def track(
         live session. Orientations are those of the filter from the start pose on.
     causal : bool
         Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
-    limits : bool
-        Keep joints with one or two axes within the limits of the model.
     accept_failed : bool
         Use a subject even if its calibration failed, which is otherwise refused.
 
@@ -95,7 +92,7 @@ def track(
     check_arguments(track, locals() | {"subject": person})
     if person is not None and not accept_failed:
         person.check_quality()
-    options: dict[str, Any] = {"static_test": static_test, "open_loop": open_loop, "causal": causal, "limits": limits}
+    options: dict[str, Any] = {"static_test": static_test, "open_loop": open_loop, "causal": causal}
     tracker = Tracker(person, model=model, method=method, **options)
     [result] = track_chunks(tracker, recording, np.inf)
     summary = summarize(result)

@@ -17,7 +17,7 @@ from ..body.kinematics import Pose, build_pose_table, find_usual_rate
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic, notebook_html
 from ..errors import BadData, Named, WeposeError
-from ..recording import Intervals, Mark, Recording
+from ..recording import Intervals, Recording
 from .headings import HeadingCorrection
 from .segment_orientations import SegmentOrientations
 
@@ -40,7 +40,6 @@ class TrackResult:
     model: BodyModel  # the body with the subject's lengths
     subject: Subject  # lengths and mounts as used
     phases: Mapping[str, Intervals] = field(default_factory=dict)  # name → intervals [s] of the recording
-    marks: tuple[Mark, ...] = ()  # texts that were marked in a live session, with their times [s]
     # From `track` the recording and the intermediate results, also as `recording` and `segments`; from `load_result`
     # the folder; None: made in code.
     source: SegmentOrientations | Path | None = None

@@ -79,7 +79,7 @@ class Tracker:
     subject : lengths and mounts; None: the population prior and the mounts that the session states
     model : a body, its file, or the name of a body of the package, scaled to the subject's lengths; None: the one that
         the recording names, else the upper body. Without a subject a model that is given or named keeps its own lengths
-    method, static_test, open_loop, causal, limits : as in `track`
+    method, static_test, open_loop, causal : as in `track`
 
     Attributes
     ----------
@@ -100,14 +100,13 @@ class Tracker:
         static_test: StaticTest | None = None,
         open_loop: bool = False,
         causal: bool = False,
-        limits: bool = True,
     ) -> None:
         check_method(method)
         if causal and method in OFFLINE:
             raise BadOption(f"method '{method}' needs the whole recording; 'amekf' looks at nothing ahead")
         self.options = {"method": method, "static_test": static_test, "open_loop": open_loop}
-        self.options |= {"causal": causal, "limits": limits}
-        self._method, self._static_test, self._causal, self._limits = method, static_test, causal, limits
+        self.options |= {"causal": causal}
+        self._method, self._static_test, self._causal = method, static_test, causal
         self._subject, self._model, self._observes_headings = subject, model, not open_loop
         self._where = ""  # begins an error's text; empty before the first chunk
         self._kinematics: KinematicsSolver | None = None
@@ -359,14 +358,14 @@ class Tracker:
         )
         if self._kinematics is None:
             start = self._start_pose.q
-            self._kinematics = KinematicsSolver(body, self.names, limits=self._limits, start=start)
+            self._kinematics = KinematicsSolver(body, self.names, start=start)
         pose = self._kinematics.solve_chunk(chunk.time, make_correction(body, self.names)(quat_WL))
         shape_cov = self._person.shape_covariance(body.table)
         shared = {} if correction is None else correction.correlate_segments(chunk.time, covariances)
         point_cov = compute_point_covariances(body, pose.quat_WL, covariances, shape_cov, pose.q, shared)
         gap = {name: sensor.gap for name, sensor in chunk.sensors.items() if sensor.gap is not None}
         pose = replace(pose, segment_cov=covariances, heading_cov=shared, point_cov=point_cov, gap=gap)
-        return TrackResult(chunk.name, pose, body, self._person, chunk.phases, chunk.marks, segments, correction)
+        return TrackResult(chunk.name, pose, body, self._person, chunk.phases, segments, correction)
 
     # Single samples --------------------------------------------------------------------------------------------------
 

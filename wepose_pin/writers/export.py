@@ -15,7 +15,7 @@ import polars as pl
 from ..angles import angle_table, diagnose_lock, joint_angles
 from ..arguments import check_arguments
 from ..body.kinematics import build_pose_table
-from ..diagnostics import Diagnostic, notebook_html
+from ..diagnostics import Diagnostic
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file, find_plugins, load_plugin
@@ -102,9 +102,6 @@ class Exported(NamedTuple):
 
     format: str  # one of `list_formats`
     diagnostics: list[Diagnostic]  # what of the result the format cannot hold
-
-    def _repr_html_(self) -> str:
-        return notebook_html(self, self.diagnostics)
 
 
 def export(

@@ -43,7 +43,7 @@ from ..documents import toml_key, whole_folder
 from ..errors import ExistingOutput, MissingFile
 from ..libraries import asset, check_file, library_errors
 from ..readers import format_keys
-from ..recording import ImuSensor, Intervals, Mark, Recording, find_mount_axes, select_interval
+from ..recording import ImuSensor, Intervals, Recording, find_mount_axes, select_interval
 from ..tracking import TrackResult, TrackSummary
 
 POSE = "pose.parquet"
@@ -182,8 +182,6 @@ def write_about(
         about["torques"] = torques.summary()
     spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in tracked.phases.items()}
     about |= {"recorded_phases": spans, "versions": versions()}
-    if tracked.marks:
-        about["recorded_marks"] = [[mark.time, mark.text] for mark in tracked.marks]
     if provenance is not None:
         about["provenance"] = dict(provenance)
     (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
@@ -254,14 +252,11 @@ def load_result(folder: str | Path) -> TrackResult:
     with library_errors(file, "the summary of a result"):
         summary |= json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
         diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
-        marks = tuple(Mark(float(time), str(text)) for time, text in summary.get("recorded_marks", ()))
     subject, model = load_subject(folder), load_model(folder / SUBJECT_URDF)
     if model.table.girdles:
         model = replace(model, girdles=subject.girdles)
     name, phases = str(summary.get("recording") or folder.name), read_phases(summary)
-    return TrackResult(
-        name, pose, model, subject, phases, marks, source=folder, summary=summary, diagnostics=diagnostics
-    )
+    return TrackResult(name, pose, model, subject, phases, folder, summary=summary, diagnostics=diagnostics)
 
 
 def select_pose(result: TrackResult, interval: tuple[float, float] | None, phase: str | None) -> Pose:
