@@ -16,6 +16,7 @@ from test_model import example_robot_data_human
 import wepose_pin as wp
 from benchmarks.ur5_arm import BENT, SENSED, TABLE
 from wepose_pin import BodyModel, ImuSensor, Recording, load_model
+from wepose_pin.calibration.protocols import load_protocol
 from wepose_pin.recording import CONFIGURATION, compute_mount
 from wepose_pin.writers import write_session
 
@@ -247,6 +248,17 @@ def test_a_foreign_person_loads(name: str, data: Path, folder: Path, capsys: pyt
 def test_a_foreign_robot_loads(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text, named = ROBOTS[name]
     check_foreign(example_robot_data_human().parents[2] / name, text, named, folder, capsys)
+
+
+def test_one_arm_with_a_rigid_hand_has_the_length_of_each(tmp_path: Path) -> None:
+    text = (ROOT / "urdf" / "upper_body.urdf").read_text(encoding="utf-8")
+    (tmp_path / "arm.urdf").write_text(re.sub(r'(name="right_hand_[xyz]" type=)"revolute"', r'\1"fixed"', text))
+    links = "".join(f'{name} = "{name}"\n' for name in ("torso", "right_upper_arm", "right_forearm", "right_hand"))
+    (tmp_path / "arm.toml").write_text(f'like = "upper_body"\n[segments]\n{links}[points]\nright_palm = "right_palm"\n')
+    body = load_model(tmp_path / "arm.urdf")
+    load_protocol("free").check_body(body.table)  # it names a length that this body does not have, as an example
+    for name, value in body.lengths.items():
+        assert body.with_lengths({name: 1.1 * value}).lengths == pytest.approx(body.lengths | {name: 1.1 * value})
 
 
 def test_a_session_on_a_robot_without_a_table_says_what_is_missing(

@@ -300,7 +300,7 @@ def check_segments(table: BodyTable, names: Iterable[str], where: str, error: ty
     for name in names:
         if name not in table.segments:
             others = [body for body in _list_bodies() if name in load_table(body).segments]
-            known = f"the body {others[0]} has it" if others else one_of(table.segments, name)
+            known = f"the body {others[-1]} has it" if others else one_of(table.segments, name)
             if others and where.endswith("sensors."):
                 known += f"; to do without that sensor, write ignore = true in [sensors.{name}]"
             raise error(f"{where}{name} is no segment of {table.name}; {known}")

@@ -53,9 +53,9 @@ class Tree(NamedTuple):
             link = joints[-1].parent
         return joints[::-1]
 
-    def body(self, link: str) -> str:
-        """Return the uppermost link that is rigid with `link`."""
-        while link != self.root and self.above[link].type == "fixed":
+    def body(self, link: str, others: Collection[str] = ()) -> str:
+        """Return the uppermost link that is rigid with `link`, without the links `others` and what is above them."""
+        while link != self.root and self.above[link].type == "fixed" and self.above[link].parent not in others:
             link = self.above[link].parent
         return link
 
@@ -359,7 +359,10 @@ def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretche
     spine below it, down to the next segment or the root, which keep their shape.
     """
     lines, of_links, of_joints = _find_lines(tree, table), _Stretches(), _Stretches()
-    starts = {tree.body(segment.link) for segment in table.segments.values()}
+    links_of = {name: segment.link for name, segment in table.segments.items()}
+    starts: dict[str, str] = {}  # segment → its uppermost link, below that of a segment with which it is rigid
+    for name in sorted(links_of, key=lambda name: len(tree.path(links_of[name]))):
+        starts[name] = tree.body(links_of[name], starts.values())
     for segment, own in table.segments.items():
         names = [name for name, length in table.lengths.items() if length.segment == segment]
         if not names:
@@ -372,9 +375,9 @@ def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretche
             )
         dual = np.linalg.pinv(basis)  # across the lines of one or two lengths nothing changes
         parts = {name: np.outer(basis[:, k], dual[k]) for k, name in enumerate(names)}
-        start = tree.body(own.link)
-        links, spine = tree.hanging(start, starts), tree.path(start) if own.spine else []
-        spine = spine[max((k for k, joint in enumerate(spine) if joint.parent in starts), default=0) :]
+        links = tree.hanging(starts[segment], starts.values())
+        spine = tree.path(starts[segment]) if own.spine else []
+        spine = spine[max((k for k, joint in enumerate(spine) if joint.parent in starts.values()), default=0) :]
         links += [joint.parent for joint in spine[1:]]
         of_links |= dict.fromkeys(links, parts)
         of_joints |= {joint.name: parts for link in links for joint in tree.below[link]}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import BodyModel
+from ..body import BodyModel, list_breadths
 from ..body.mounts import (
     MAX_MOUNT_ERROR_DEG,
     MEASURED_ORIENTATION_STD,
@@ -86,10 +86,13 @@ class CalibrationProblem:
 
     @property
     def measured_example(self) -> str:
-        """The best measurement of the scale, ``name=metres``: the protocol's, then the longest length of a closure."""
-        names = [name for name in self.layout.lengths_in_closures if name not in self.measured]
-        if not names or (self.protocol.measured_example and not self.measured):
-            return self.protocol.measured_example
+        """The best measurement of the scale, ``name=metres``: the protocol's, then the longest length that counts."""
+        example, table = self.protocol.measured_example, self.model.table
+        lengths = self.layout.lengths_in_closures or self.model.lengths
+        names = [name for name in lengths if name not in self.measured]
+        is_known = example.partition("=")[0] in (*table.lengths, *list_breadths(table))
+        if not names or (is_known and not self.measured):
+            return example
         return f"{max(names, key=self.model.lengths.__getitem__)}=METRES"
 
     # Mounts and labels ------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..body import BodyModel, BodyTable, list_breadths
+from ..body import BodyModel, BodyTable, list_breadths, load_table
 from ..body.mounts import PALM_SLIP_STD, StartPose
 from ..body.table import ZERO, Vector, check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
@@ -135,7 +135,7 @@ class Protocol:
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
         check_segments(table, (*named, *self.needs), where, BadOption)
         measured = self.measured_example.partition("=")[0]
-        if measured and measured not in (*table.lengths, *list_breadths(table)):
+        if measured and not any(measured in (*each.lengths, *list_breadths(each)) for each in (table, load_table())):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
     def resolve(

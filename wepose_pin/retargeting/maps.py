@@ -36,7 +36,7 @@ class LinkPoint(NamedTuple):
     """A point of the robot, at `offset` [m] in the frame of a link."""
 
     link: str
-    offset: Annotated[tuple[float, float, float], Key("offset", "m")] = (0.0, 0.0, 0.0)
+    offset: Annotated[tuple[float, float, float], Key("offset", "m", -10.0, 10.0)] = (0.0, 0.0, 0.0)
 
 
 class HandPoint(NamedTuple):
@@ -45,7 +45,7 @@ class HandPoint(NamedTuple):
     link: str
     fingers: Annotated[str, Key(of="axes")]
     thumb: Annotated[str, Key(of="axes")]
-    offset: Annotated[tuple[float, float, float], Key("offset", "m")] = (0.0, 0.0, 0.0)
+    offset: Annotated[tuple[float, float, float], Key("offset", "m", -10.0, 10.0)] = (0.0, 0.0, 0.0)
 
 
 class ArmMap(NamedTuple):

@@ -118,9 +118,8 @@ class TrackSummary:
 
     @cached_property
     def undetermined_joints(self) -> list[str]:
-        """The joints of a mechanism that the measured segments leave open, at least in part: they move little."""
-        model = self.last.model
-        return find_undetermined_joints(model, self.last.quat_WL) if model.table.is_mechanism else []
+        """The joints that the measured segments leave open, at least in part: they move little."""
+        return find_undetermined_joints(self.last.model, self.last.quat_WL)
 
     @cached_property
     def error_budget(self) -> dict[str, dict[str, float]]:
@@ -235,7 +234,7 @@ class TrackSummary:
         if missing and lacking:
             facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
             yield Diagnostic("sensors-missing", INFO, facts=facts)
-        if self.undetermined_joints:
+        elif self.undetermined_joints:
             facts = {"variant": "joints", "joints": ", ".join(self.undetermined_joints)}
             yield Diagnostic("sensors-missing", WARNING, facts=facts)
         for segment, rms in self.residual_rms.items():
