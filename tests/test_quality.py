@@ -202,7 +202,6 @@ def test_exit_code_and_file_carry_the_quality(
         assert any(each["severity"] != "info" for each in content["diagnostics"]) == (wanted != "pass")
         assert all(each["text"]["do"] for each in content["diagnostics"])
         assert {check["quality"] for check in content["checks"]} == {"pass", wanted}
-        assert len(content["gap"]["time"]) <= 600
         assert content["mounts"].keys() == anywhere.quat_LS.keys()
         assert content["lengths"]["left_upper_arm"]["std"] > 0.0
         assert {"wepose-pin", "casadi"} <= content["versions"].keys()

@@ -31,29 +31,7 @@ DASHES = {  # by the place among the lines of a side
     "other": ("-", (0, (2, 1)), (0, (6, 1))),
 }
 SHADE, BAND, SOFT, ALARM = "#e9eef4", "#cdd9e5", "#8794a3", "#b23a48"
-STYLE: Any = {
-    "font.family": ["sans-serif"],
-    "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial"],
-    "font.size": 8.5,
-    "axes.titlesize": 9.0,
-    "axes.titlelocation": "left",
-    "axes.titley": 1.02,  # a stated height: matplotlib searches for one by the extents of all labels
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": SOFT,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.xmargin": 0.0,
-    "grid.color": "#e3e7ec",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.1,
-    "legend.frameon": False,
-    "hatch.linewidth": 0.6,
-    "hatch.color": SOFT,
-    "path.simplify_threshold": 0.4,  # [px]
-    "svg.fonttype": "none",
-    "svg.hashsalt": "wepose",
-}
+STYLE = mpl.rc_params_from_file(Path(__file__).with_name("wepose.mplstyle"), use_default_template=False)
 Spans = Iterable[Sequence[float]] | np.ndarray
 styled = mpl.rc_context(STYLE)  # decorates what draws in the style of the reports, whatever the caller's rcParams
 

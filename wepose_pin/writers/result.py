@@ -50,7 +50,6 @@ POSE = "pose.parquet"
 JOINTS = "joints.parquet"
 SUBJECT_URDF = "subject.urdf"
 ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
-MOST_POINTS = 600  # of the residual of a calibration over time
 
 
 def write_session(folder: Path, recording: Recording, truth: Pose | None = None) -> None:
@@ -101,7 +100,6 @@ def write_calibration(folder: Path, calibration: Calibration, provenance: Mappin
 def _document(calibration: Calibration) -> dict[str, Any]:
     """The content of ``calibration.json``; lengths [m], times [s], angles as named, checks and diagnostics SI."""
     subject, quality = calibration.subject, calibration.quality
-    some = slice(None, None, -(-len(calibration.time) // MOST_POINTS))
     return {
         "quality": quality.quality,
         "diagnostics": [diagnostic_as_json(diagnostic) for diagnostic in quality.diagnostics],
@@ -128,12 +126,6 @@ def _document(calibration: Calibration) -> dict[str, Any]:
             for joint, rms in calibration.hinge_rms.items()
         },
         "gap_rms": {"after": calibration.rms_gap, "before": calibration.prior_rms_gap},
-        "gap": {
-            "time": calibration.time[some].round(3),
-            "after": calibration.gap[some],
-            "before": calibration.prior_gap[some],
-            "contact": calibration.contact[some].round(3),
-        },
         "open_intervals": calibration.open_intervals,
         "effective_sample_size": calibration.effective_sample_size,
         "moved": dict(calibration.exchanged),
