@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from .compilation import compiled, inlined, kernel
+from .compilation import compiled, fma, inlined, kernel
 
 
 def xyzw_from_wxyz(quat_wxyz: ArrayLike) -> np.ndarray:
@@ -129,8 +129,8 @@ def half_angle_terms(h1):  # type: ignore[no-untyped-def]
     if h1 < SERIES_HALF_ANGLE * SERIES_HALF_ANGLE:
         h2 = h1 * h1
         h4 = h2 * h2
-        s = (S0 + S1 * h1 + h2 * (S2 + S3 * h1)) + h4 * (S4 + S5 * h1 + h2 * (S6 + S7 * h1))
-        c = (C0 + C1 * h1 + h2 * (C2 + C3 * h1)) + h4 * (C4 + C5 * h1 + h2 * (C6 + C7 * h1))
+        s = fma(h4, fma(h2, fma(S7, h1, S6), fma(S5, h1, S4)), fma(h2, fma(S3, h1, S2), fma(S1, h1, S0)))
+        c = fma(h4, fma(h2, fma(C7, h1, C6), fma(C5, h1, C4)), fma(h2, fma(C3, h1, C2), fma(C1, h1, C0)))
         return s, c
     half = np.sqrt(h1)
     return 0.5 * np.sin(half) / half, np.cos(half)
@@ -143,8 +143,9 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     `quat` (4,) or more: its first four, xyzw; x, y, z [rad]
     """
     s, ew = half_angle_terms(0.25 * (x * x + y * y + z * z))
+    # 1/√ of its length before, to first order; that after the product would be waited for
+    norm = 1.5 - 0.5 * ((quat[0] * quat[0] + quat[1] * quat[1]) + (quat[2] * quat[2] + quat[3] * quat[3]))
     rx, ry, rz, rw = product(quat[0], quat[1], quat[2], quat[3], s * x, s * y, s * z, ew)
-    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 
@@ -152,8 +153,8 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
 def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     """In place: ``quat ← exp([x, y, z]) ⊗ quat``, renormalised as there; the vector is in W [rad]."""
     s, ew = half_angle_terms(0.25 * (x * x + y * y + z * z))
+    norm = 1.5 - 0.5 * ((quat[0] * quat[0] + quat[1] * quat[1]) + (quat[2] * quat[2] + quat[3] * quat[3]))
     rx, ry, rz, rw = product(s * x, s * y, s * z, ew, quat[0], quat[1], quat[2], quat[3])
-    norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 

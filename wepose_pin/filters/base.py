@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arguments import check_fields
-from ..compilation import inlined
+from ..compilation import fma, inlined
 from ..diagnostics import Diagnostic, notebook_html
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from .phases import SensorNoise
@@ -169,10 +169,10 @@ def into_sensor(R, P, more, more_heading, out):  # type: ignore[no-untyped-def]
     xx, xy, xz, yy, yz, zz = P[0], P[1], P[2], P[4], P[5], P[8] + more_heading
     for i in range(3):
         a, b, c = R[0, i], R[1, i], R[2, i]
-        u, v, w = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
-        out[i, i] = a * u + b * v + c * w + more
+        u, v, w = fma(xx, a, fma(xy, b, xz * c)), fma(xy, a, fma(yy, b, yz * c)), fma(xz, a, fma(yz, b, zz * c))
+        out[i, i] = fma(a, u, fma(b, v, fma(c, w, more)))
         for j in range(i):
-            out[i, j] = out[j, i] = R[0, j] * u + R[1, j] * v + R[2, j] * w
+            out[i, j] = out[j, i] = fma(R[0, j], u, fma(R[1, j], v, R[2, j] * w))
 
 
 def count_processors() -> int:

@@ -74,9 +74,14 @@ def _transpose(A):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _symmetric(A, variance):  # type: ignore[no-untyped-def]
-    """``A + variance I`` by the upper half of A."""
-    return A[0] + variance, A[1], A[2], A[1], A[4] + variance, A[5], A[2], A[5], A[8] + variance
+def _symmetric(A):  # type: ignore[no-untyped-def]
+    """``A`` by its upper half."""
+    return A[0], A[1], A[2], A[1], A[4], A[5], A[2], A[5], A[8]
+
+
+@inlined
+def _add_diagonal(A, x, y, z):  # type: ignore[no-untyped-def]
+    return A[0] + x, A[1], A[2], A[3], A[4] + y, A[5], A[6], A[7], A[8] + z
 
 
 @inlined
@@ -90,8 +95,9 @@ def _predict(A, C, B, R, model):  # type: ignore[no-untyped-def]
     F = _scale(-model.dt, R[0]) + _scale(-model.dt, R[1]) + _scale(-model.dt, R[2])
     A = _add_product(A, F, _transpose(C))
     C = _add_product(C, F, B)
-    A = _add_product(A, C, _transpose(F))
-    return _symmetric(A, model.attitude_var), C, _symmetric(B, model.bias_var)
+    A = _symmetric(_add_product(A, C, _transpose(F)))
+    more, more_bias = model.attitude_var, model.bias_var
+    return _add_diagonal(A, more, more, more), C, _add_diagonal(B, more_bias, more_bias, more_bias)
 
 
 @inlined
@@ -99,7 +105,7 @@ def _fuse(A, C, B, a, b, p, c, innovation, variance):  # type: ignore[no-untyped
     """Correct by a measurement of one state, whose covariances with a and b are p and c: P ← P − [p; c] [p; c]ᵀ/s."""
     share = 1.0 / variance
     gain, u, w = share * innovation, _scale(-share, p), _scale(-share, c)
-    A, C, B = _symmetric(_add_outer(A, u, p), 0.0), _add_outer(C, u, c), _symmetric(_add_outer(B, w, c), 0.0)
+    A, C, B = _symmetric(_add_outer(A, u, p)), _add_outer(C, u, c), _symmetric(_add_outer(B, w, c))
     return A, C, B, _add_scaled(a, gain, p), _add_scaled(b, gain, c)
 
 
