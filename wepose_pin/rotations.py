@@ -158,16 +158,14 @@ def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 
-def write_matrix(quat, R):  # type: ignore[no-untyped-def]
-    """`R` (3, 3) of `quat` (4,) xyzw, or (3, 3, n) of (4, n)."""
+@kernel
+def fill_matrix(quat, R):  # type: ignore[no-untyped-def]
+    """`R` (3, 3) of `quat` (4,) xyzw."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
     x2, y2, z2 = 2.0 * x, 2.0 * y, 2.0 * z
     R[0, 0], R[0, 1], R[0, 2] = 1.0 - y * y2 - z * z2, x * y2 - w * z2, x * z2 + w * y2
     R[1, 0], R[1, 1], R[1, 2] = x * y2 + w * z2, 1.0 - x * x2 - z * z2, y * z2 - w * x2
     R[2, 0], R[2, 1], R[2, 2] = x * z2 - w * y2, y * z2 + w * x2, 1.0 - x * x2 - y * y2
-
-
-fill_matrix = kernel(write_matrix)
 
 
 @kernel
@@ -194,9 +192,15 @@ def integrate(rotvec):  # type: ignore[no-untyped-def]
     return out
 
 
-def unroll(rotvec: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+@compiled
+def unroll(rotvec, vectors):  # type: ignore[no-untyped-def]
     """Vectors (n, 3), each turned by all of `rotvec` (n, 3) [rad] up to its own; one that is no number is no turn."""
-    quat = integrate(np.where(np.isfinite(rotvec), rotvec, 0.0))[1:]
-    R, (x, y, z) = np.empty((3, 3, len(vectors))), vectors.T
-    write_matrix(quat.T, R)  # type: ignore[no-untyped-call]
-    return np.ascontiguousarray((R[:, 0] * x + R[:, 1] * y + R[:, 2] * z).T)
+    quat, R, out = np.array([0.0, 0.0, 0.0, 1.0]), np.empty((3, 3)), np.empty((len(vectors), 3))
+    for k in range(len(vectors)):
+        x, y, z = rotvec[k, 0], rotvec[k, 1], rotvec[k, 2]
+        if np.isfinite(x + y + z):
+            rotate_by_vector(quat, x, y, z)
+        fill_matrix(quat, R)
+        for i in range(3):
+            out[k, i] = R[i, 0] * vectors[k, 0] + R[i, 1] * vectors[k, 1] + R[i, 2] * vectors[k, 2]
+    return out

@@ -194,7 +194,9 @@ class SensorFilters:
 
 def _rotate(quat_VS: np.ndarray, rate: np.ndarray, rate_hz: float) -> np.ndarray:
     """Return the orientation (4,) after a sample of a rate (3,) [rad/s]; a lost one rotates nothing."""
-    return rotations.multiply(quat_VS, rotations.exp(np.where(np.isfinite(rate), rate, 0.0) / rate_hz))
+    turned = quat_VS.copy()
+    rotations.rotate_by_vector(turned, *(np.where(np.isfinite(rate), rate, 0.0) / rate_hz))
+    return turned
 
 
 def collect_orientations(recording: Recording, filtered: Mapping[str, Orientation]) -> dict[str, Rotation]:

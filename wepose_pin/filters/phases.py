@@ -83,14 +83,18 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     n = len(gyro_S)
     if n < 10:
         raise BadPhase(f"the static phase holds {n} samples; at least 10 are needed to measure noise")
-    gravity = float(np.linalg.norm(accel_S, axis=1).mean())
+    gravity = float(np.sqrt(np.einsum("ni,ni->n", accel_S, accel_S)).mean())
     if not gravity > 0.0:
         raise BadPhase("the static phase holds no gravity: accel is zero; specific force is needed, +g up when static")
-    size = max(1, round(BLOCK_S * rate_hz))
+    size, accel = max(1, round(BLOCK_S * rate_hz)), accel_S / gravity
     blocks, gyro_cov = n // size, _compute_cov(gyro_S)
     # Means of blocks average white noise out and keep sway; less than four show none.
     half_second_cov = _compute_cov(average_blocks(gyro_S, size)) if blocks >= 4 else np.zeros((3, 3))
-    bias_cov = _apply_floor(gyro_cov / n if blocks < 4 or worn else half_second_cov / blocks, BIAS_FLOOR)
+    bias_cov = gyro_cov / n if blocks < 4 or worn else half_second_cov / blocks
+    covs = np.array([bias_cov, gyro_cov, _compute_cov(accel), _compute_cov(gyro_S[1:] - gyro_S[:-1])])
+    floors = np.square([BIAS_FLOOR, GYRO_FLOOR, ACCEL_FLOOR, GYRO_FLOOR])[:, None, None] * np.eye(3)
+    covs += (np.linalg.eigvalsh(covs - floors)[:, :1, None] <= 0.0) * floors  # where any direction is below its floor
+    bias_cov, gyro_cov, accel_cov, step_cov = covs
     if worn:  # what sways comes back: its mean is smaller than that of independent blocks
         half_second_cov = _estimate_sway_cov(gyro_S, size, half_second_cov)
         allowed = min(1.0, 2.0 / (SWAY_RATE * n / rate_hz) ** 2)
@@ -98,11 +102,11 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     return SensorNoise(
         gyro_bias=average_blocks(gyro_S, n)[0],
         gyro_bias_cov=bias_cov,
-        gyro_cov=_apply_floor(gyro_cov, GYRO_FLOOR),
-        accel_cov=_apply_floor(_compute_cov(accel_S / gravity), ACCEL_FLOOR),
-        bias_step_cov=_apply_floor(_compute_cov(gyro_S[1:] - gyro_S[:-1]), GYRO_FLOOR),
+        gyro_cov=gyro_cov,
+        accel_cov=accel_cov,
+        bias_step_cov=step_cov,
         gravity=gravity,
-        accel_step_var=float(np.diff(accel_S / gravity, axis=0).var(axis=0).mean()),
+        accel_step_var=_compute_step_var(accel),
         gyro_half_second_cov=half_second_cov,
     )
 
@@ -116,7 +120,7 @@ def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray) -> n
     degrees = len(gyro_S) // size - 1
     if degrees < 3:
         return SWAY_RATE_STD**2 * np.eye(3)
-    white = float(np.diff(gyro_S, axis=0).var(axis=0).mean()) / 2.0 / size
+    white = _compute_step_var(gyro_S) / 2.0 / size
     excess = float(np.trace(measured)) / 3.0 - white
     prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
     return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
@@ -128,16 +132,17 @@ def _compute_cov(values: np.ndarray) -> np.ndarray:
     return np.asarray(off.T @ off * (1.0 / (len(values) - 1)))
 
 
+def _compute_step_var(values: np.ndarray) -> float:
+    """Compute the variance of the first differences of samples (n, 3), the mean over the axes."""
+    steps = values[1:] - values[:-1]
+    off = steps - average_blocks(steps, len(steps))
+    return float(np.vdot(off, off)) / off.size
+
+
 def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
     """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of the time of `mean`."""
     count = len(values) // size
     return np.asarray(np.full(size, 1.0 / size) @ values[: count * size].reshape(count, size, 3))
-
-
-def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
-    """Add the variance of the floor where the covariance falls below it along any direction."""
-    floor = std**2 * np.eye(3)
-    return cov if np.linalg.eigvalsh(cov - floor)[0] > 0.0 else cov + floor
 
 
 def estimate_start_tilt(

@@ -98,7 +98,7 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
         (test.beta, noise.accel_cov, noise.accel_step_var / 2.0),
     ):
         if white_share < 1.0:  # what is taken away, the quietest axis has too
-            white_var = min(white_var, np.linalg.norm(cov, -2))
+            white_var = min(white_var, np.linalg.eigvalsh(cov)[0])
         limits.append((factor * cov + (factor - 1.0) * (white_share - 1.0) * white_var * np.eye(3))[_UPPER])
     model = make_record(
         inverse_gravity=1.0 / noise.gravity,  # [s²/m]

@@ -293,7 +293,7 @@ def _may_saturate(values, least):  # type: ignore[no-untyped-def]
     """Return whether an odd row repeats a value, `least` or more: in a plateau one does, in few other signals."""
     for row in range(1, len(values), 2):
         for k in range(3):
-            if abs(values[row, k] - values[row - 1, k]) <= 2.0 * ROUNDING * least and abs(values[row, k]) >= least:
+            if abs(values[row, k]) >= least and abs(values[row, k] - values[row - 1, k]) <= 2.0 * ROUNDING * least:
                 return True
     return False
 
