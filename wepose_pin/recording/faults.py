@@ -206,11 +206,13 @@ def _may_have_faults(values):  # type: ignore[no-untyped-def]
     for k in range(3):
         if end > 0 and values[begin, k] == values[middle, k] == values[end, k]:
             return True
-    repeats = 0
-    for row in range(1, len(values)):
-        same = values[row - 1, 0] == values[row, 0] and is_same(values[row - 1], values[row])
-        repeats = repeats + 1 if same else 0
-        if repeats == FROZEN_SAMPLES - 1:
+    for row in range(0, len(values), FROZEN_SAMPLES):  # so many rows in a row have one of these
+        first = last = row
+        while first > 0 and is_same(values[first - 1], values[row]):
+            first -= 1
+        while last < end and is_same(values[last + 1], values[row]):
+            last += 1
+        if last - first >= FROZEN_SAMPLES - 1:
             return True
     return False
 
