@@ -57,6 +57,7 @@ class SessionSummary(NamedTuple):
     latency: np.ndarray = np.empty(0)  # (n,) [s] of the newest ticks with a sample, from its time to its pose
     diagnostics: tuple[Diagnostic, ...] = ()
     record: Path | None = None  # the recording
+    problems: Mapping[str, int] = {}  # problem → count of what the source left out
 
 
 class LiveLoop(Stage):
@@ -135,7 +136,9 @@ class LiveLoop(Stage):
         rows = zip(self.source.sensors, self._stream.clock.counts.tolist(), strict=True)
         counts = {name: dict(zip(COUNTS, row, strict=True)) for name, row in rows}
         seconds, latency = self._last_pose - self._first_pose, np.array(self._latency)
-        return SessionSummary(self._poses, seconds, counts, latency, self._diagnostics, self.log.path)
+        return SessionSummary(
+            self._poses, seconds, counts, latency, self._diagnostics, self.log.path, self.source.problems
+        )
 
     # Samples to poses ------------------------------------------------------------------------------------------------
 
