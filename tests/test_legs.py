@@ -164,3 +164,13 @@ def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
     session.write_text(text, encoding="utf-8")
     assert run("track", made, "-o", tmp_path / "result") == 0
     assert "left_thigh_qx" not in pl.read_parquet_schema(tmp_path / "result" / "pose.parquet")
+
+
+def test_what_the_torso_does_not_carry_shares_how_that_is_turned() -> None:
+    """Legs that stand together are off together, for x of W is where the torso faces; an arm goes with the torso."""
+    recording = simulate_activity("walk", seed=2, noise=NOISE_FREE, seconds=4.0).recording()
+    pose = wp.track(recording, model="whole_body", causal=True).pose
+    variance = {name: cov[-1, 2, 2] for name, cov in pose.segment_cov.items()}
+    for near, far, least, most in (("pelvis", "left_thigh", 0.4, 1.0), ("pelvis", "left_upper_arm", -0.2, 0.2)):
+        shared = next(cov[-1] for pair, cov in pose.heading_cov.items() if set(pair) == {near, far})
+        assert least < shared / np.sqrt(variance[near] * variance[far]) < most

@@ -86,6 +86,13 @@ class BodyModel:
         """
         return next((joint for joint in reversed(self.chains[segment]) if self.pin.nvs[joint] == 3), None)
 
+    def find_trunk(self, segment: str) -> str | None:
+        """Find the segment of the spine that carries a segment, itself if it is one; None: there is none."""
+        above: str | None = segment
+        while above is not None and not self.table.segments[above].spine:
+            above = self.parents[above]
+        return above
+
     @cached_property
     def reaches(self) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
         """Point → link → its part of the way from the root, the same for all lengths (`measure_reaches`)."""

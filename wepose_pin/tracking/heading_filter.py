@@ -62,6 +62,9 @@ MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accele
 # People stand off the start pose as the population does, or by a share of it where they take care: the share, and how
 # likely that is before anything is observed; assumptions.
 CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.05
+# Share of the variance of a pelvis', leg's or head's heading that is by the torso's turn: 4 of 5° (docs/people.md). The
+# arms do not show it: a careful person has half of that turn, by which a person differs between two start poses.
+TURN_VAR_SHARE, CAREFUL_TURN_SHARE = (4.0 / 5.0) ** 2, 0.5
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
@@ -122,7 +125,7 @@ class HeadingFilter:
     ----------
     pairs, hinges, palms : joints between two sensors, hinges, and the points that the phase `CLASP` joins
     is_observed : whether one of them tells of the headings
-    start_var, mount_cov : (k,), (k, k) [rad²] of headings at the end of the start pose, by the pose and by the mounts
+    start_cov, mount_cov : (k, k) each [rad²] of headings at the end of the start pose, by the pose and by the mounts
     stride : sensors' samples from one sample of a knot to the next
     x, P : (n,), (n, n); the first k are δ [rad]
     process : how x changes in the last knot besides what it does by itself, the variance of that; (n,) each; and the
@@ -179,17 +182,23 @@ class HeadingFilter:
         # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
         # gyroscope's bias, or the drift of measured orientations.
         self._drift_psd, rate_std = np.full(k, DRIFT_PSD), np.full(k, MEASURED_RATE_STD)
-        self.start_var, self._again_var = np.full((2, k), REFERENCE_START_STD**2)
+        start_vars = np.full((2, k), REFERENCE_START_STD**2)
         for i, name in enumerate(self.names):
             if name in noises:  # a gyroscope's white noise may be more
                 gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
                 self._drift_psd[i] = max(DRIFT_PSD, gyro_psd)
                 rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
             if name != model.table.reference:
-                self.start_var[i], self._again_var[i] = (
+                start_vars[:, i] = [
                     compute_start_heading_var(first, name, subject, StartPose(table=model.table, repeat_share=share))
                     for share in (repeat_share, 1.0)
-                )
+                ]
+        # Since W's x is where the torso faces, its turn is an error of all headings that it does not carry with it.
+        carried = [bool(kind) or model.find_trunk(name) in (None, model.table.reference) for name in self.names]
+        shares = TURN_VAR_SHARE * np.outer(np.logical_not(carried), np.logical_not(carried))
+        by_turn = [shares * np.minimum.outer(var, var) for var in start_vars]
+        apart = [np.diag(var - np.diag(cov)) for var, cov in zip(start_vars, by_turn, strict=True)]
+        self.start_cov, self._again_cov = np.add(apart, by_turn)
         # (k, k) [rad²]; a calibration knows the headings of mounts against each other better than that of each.
         self.mount_cov = LEAST_MOUNT_VAR * np.eye(k)
         if not first.remounted:
@@ -236,8 +245,10 @@ class HeadingFilter:
             for i, hinge in enumerate(self.hinges)
         ]
         self._shape_cov = subject.shape_covariance(model.table)
-        # What care adds to the information (k,) [1/rad²] of the start pose.
-        self._care_information = (CAREFUL_SHARE**-2 - 1.0) / self.start_var
+        # What care adds to the information (k, k) [1/rad²] of the start pose, and by how much it shrinks its volume.
+        careful = np.linalg.inv(CAREFUL_SHARE**2 * apart[0] + CAREFUL_TURN_SHARE**2 * by_turn[0])
+        self._care_information = careful - np.linalg.inv(self.start_cov)
+        self._care_log_det = np.linalg.slogdet(careful @ self.start_cov)[1]
         self.reset(np.zeros(k))
         # Recent misfit e of each joint's accelerations, with its force f: sums of e fᵀ (9), e² (3) and f² (3) [m²/s⁴]
         # over samples, in which older ones count less, and how many count.
@@ -257,8 +268,8 @@ class HeadingFilter:
 
         `again`: it is another start pose than that of the calibration, whatever the first one was.
         """
-        self.start_var = self._again_var if again else self.start_var
-        P, start_cov, mount_cov = self.P, np.diag(self.start_var), self.mount_cov
+        self.start_cov = self._again_cov if again else self.start_cov
+        P, start_cov, mount_cov = self.P, self.start_cov, self.mount_cov
         heading, mount, start = (self._columns[name] for name in ("heading", "mount", "start"))
         self.x[heading], self.x[start] = headings, 0.0
         for columns in (heading, mount, start):
@@ -525,16 +536,16 @@ class HeadingFilter:
         """Return the probability that the person took care in the start pose, by a state and its covariance.
 
         The filter's start pose is that of the population. With care, its headings have `CAREFUL_SHARE` of the standard
-        deviation. The likelihood of that follows in closed form from what the filter knows of the errors s of the start
-        pose, which are states. Only accelerations of joints tell that much. Causally it is 0: in the first minute they
-        do not tell which is right.
+        deviation, and the torso's turn `CAREFUL_TURN_SHARE`. The likelihood of that follows in closed form from what
+        the filter knows of the errors s of the start pose, which are states. Only accelerations of joints tell that
+        much. Causally it is 0: in the first minute they do not tell which is right.
         """
         if self.causal or not self.pairs:
             return 0.0
         columns, information = self._columns["start"], self._care_information
-        s, spread = x[columns], np.eye(len(columns)) + information[:, None] * P[np.ix_(columns, columns)]
-        misfit = s @ np.linalg.solve(spread, information * s)
-        log_ratio = -len(s) * np.log(CAREFUL_SHARE) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
+        s, spread = x[columns], np.eye(len(columns)) + information @ P[np.ix_(columns, columns)]
+        misfit = s @ np.linalg.solve(spread, information @ s)
+        log_ratio = 0.5 * (self._care_log_det - np.linalg.slogdet(spread)[1] - misfit)
         return float(expit(logit(CAREFUL_PROBABILITY) + log_ratio))
 
     def estimate(self, x: np.ndarray, P: np.ndarray, care: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -546,8 +557,8 @@ class HeadingFilter:
         """
         columns, information, k = self._columns["start"], self._care_information, len(self.names)
         rows, by_start = np.concatenate([self._columns["heading"], self._columns["mount"]]), P[:, columns]
-        spread = np.eye(k) + information[:, None] * by_start[columns]
-        gain = by_start[rows] @ np.linalg.solve(spread, np.diag(information))
+        spread = np.eye(k) + information @ by_start[columns]
+        gain = by_start[rows] @ np.linalg.solve(spread, information)
         change = -gain @ x[columns]
         cov = symmetric(P[np.ix_(rows, rows)] - care * gain @ by_start[rows].T)
         cov += care * (1.0 - care) * np.outer(change, change)

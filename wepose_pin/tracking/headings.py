@@ -108,7 +108,7 @@ class HeadingCorrector:
         self._quat_VS, self._accel_S = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
         self._clasped = np.zeros(self._size, dtype=bool)
         self._from, self._to, self._at_reset = np.zeros((3, k))
-        self._start_var = self.filter.start_var
+        self._start_cov = self.filter.start_cov
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
@@ -204,7 +204,7 @@ class HeadingCorrector:
 
     def _set_variance(self, segment_covariance: np.ndarray) -> None:
         left, correction = self._to - self._from, self._to - self._at_reset  # until it has faded in
-        other = correction**2 + (self.filter.start_var - self._start_var)
+        other = correction**2 + np.diag(self.filter.start_cov - self._start_cov)
         self.variance = np.array([np.diag(segment_covariance) + left**2, self._var_at_knot, other])
 
     def collect(self, knots: Sequence[tuple[Any, ...]] | None = None) -> HeadingCorrection:

@@ -271,7 +271,7 @@ class TrackSummary:
             yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING)
         if correction is None:
             return
-        start_var = correction.filter.start_var + np.diag(correction.filter.mount_cov)
+        start_var = np.diag(correction.filter.start_cov + correction.filter.mount_cov)
         for (name, turned_deg), variance in zip(correction.max_correction_deg.items(), start_var, strict=True):
             orientation = self.tracked.segments.orientation.get(name)
             if orientation is not None and orientation.attitude_cov is not None:
