@@ -119,7 +119,10 @@ def find_person_arm(table: BodyTable, side: str) -> Limb:
     for tip, limb in table.drawn_limbs.items():
         if table.side(tip) == side and limb.base is not None and len(limb.segments) == len(limb.points) - 1 == LINKS:
             return limb
-    raise BadData(f"{table.name} has no {side} arm of {LINKS} segments, as shoulder, elbow, wrist and palm bound them")
+    raise BadData(
+        f"the person's body has no {side} arm of {LINKS} segments, as shoulder, elbow, wrist and palm bound them, and "
+        f"the other one of the same names; track with --model upper_body, on which sensors may be missing"
+    )
 
 
 def find_hand_segment(limb: Limb, measured: Collection[str]) -> str:
