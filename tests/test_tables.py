@@ -250,9 +250,12 @@ def test_a_foreign_robot_loads(name: str, folder: Path, capsys: pytest.CaptureFi
     check_foreign(example_robot_data_human().parents[2] / name, text, named, folder, capsys)
 
 
-def test_one_arm_with_a_rigid_hand_has_the_length_of_each(tmp_path: Path) -> None:
+@pytest.mark.parametrize("adapter", ["0 0 0", "0 0 -0.02"])
+def test_one_arm_with_a_rigid_hand_has_the_length_of_each(adapter: str, tmp_path: Path) -> None:
     text = (ROOT / "urdf" / "upper_body.urdf").read_text(encoding="utf-8")
-    (tmp_path / "arm.urdf").write_text(re.sub(r'(name="right_hand_[xyz]" type=)"revolute"', r'\1"fixed"', text))
+    text = re.sub(r'(name="right_hand_[xyz]" type=)"revolute"', r'\1"fixed"', text)
+    wrist = '(<child link="right_hand_y_link"/><origin xyz=")0 0 0'  # what is between forearm and hand is the forearm's
+    (tmp_path / "arm.urdf").write_text(re.sub(wrist, rf"\g<1>{adapter}", text))
     links = "".join(f'{name} = "{name}"\n' for name in ("torso", "right_upper_arm", "right_forearm", "right_hand"))
     (tmp_path / "arm.toml").write_text(f'like = "upper_body"\n[segments]\n{links}[points]\nright_palm = "right_palm"\n')
     body = load_model(tmp_path / "arm.urdf")

@@ -53,9 +53,9 @@ class Tree(NamedTuple):
             link = joints[-1].parent
         return joints[::-1]
 
-    def body(self, link: str, others: Collection[str] = ()) -> str:
-        """Return the uppermost link that is rigid with `link`, without the links `others` and what is above them."""
-        while link != self.root and self.above[link].type == "fixed" and self.above[link].parent not in others:
+    def body(self, link: str) -> str:
+        """Return the uppermost link that is rigid with `link`."""
+        while link != self.root and self.above[link].type == "fixed":
             link = self.above[link].parent
         return link
 
@@ -360,9 +360,10 @@ def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretche
     """
     lines, of_links, of_joints = _find_lines(tree, table), _Stretches(), _Stretches()
     links_of = {name: segment.link for name, segment in table.segments.items()}
-    starts: dict[str, str] = {}  # segment → its uppermost link, below that of a segment with which it is rigid
+    starts: dict[str, str] = {}  # segment → its uppermost link, or its own where a segment above is rigid with it
     for name in sorted(links_of, key=lambda name: len(tree.path(links_of[name]))):
-        starts[name] = tree.body(links_of[name], starts.values())
+        start = tree.body(links_of[name])
+        starts[name] = links_of[name] if start in starts.values() else start
     for segment, own in table.segments.items():
         names = [name for name, length in table.lengths.items() if length.segment == segment]
         if not names:

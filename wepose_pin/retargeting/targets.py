@@ -120,8 +120,8 @@ def find_person_arm(table: BodyTable, side: str) -> Limb:
         if table.side(tip) == side and limb.base is not None and len(limb.segments) == len(limb.points) - 1 == LINKS:
             return limb
     raise BadData(
-        f"the person's body has no {side} arm of {LINKS} segments, as shoulder, elbow, wrist and palm bound them, and "
-        f"the other one of the same names; track with --model upper_body, on which sensors may be missing"
+        f"the person's body has no {side} arm of {LINKS} segments from shoulder to palm with a counterpart on the "
+        f"other side; track with --model upper_body, which works even if sensors are missing"
     )
 
 
