@@ -204,8 +204,8 @@ def _print_end(session: SessionSummary, robot: RobotOutput | None, record: Path 
         title = f"{session.poses} poses in {session.seconds:.1f} s; {latency}"
     titles = ("sensor", "ticks without", "late", "twice", "unsound", "samples", "frozen", "cut off")
     print_table(title, titles, [(name, *map(str, counts.values())) for name, counts in session.counts.items()])
-    if session.problems:
-        say(f"Left out: {', '.join(f'{count} {problem}' for problem, count in session.problems.items())}.")
+    for problem, count in session.problems.items():
+        say(f"Left out: {problem} ({count}).")
     if robot is not None:
         posed, name = robot.states.total(), robot.robot.map.name
         shares = ", ".join(f"{100.0 * count / posed:.1f} % {state}" for state, count in robot.states.most_common())
