@@ -98,6 +98,7 @@ SAYS = [
     ("[phases]", "[phases", "session.toml: not valid TOML: Expected"),
     ("arm.csv", "x", "x: no such file; there is: arm.csv"),
     ("\n[data]", "\nnme = 'x'\n[data]", "session.toml: nme is not a known"),
+    ("start = [[0.5, 2.5]]", "still = [[0.5, 2.5]]", "phases.still is called static now: write static = [[from, to]]"),
     ("gyro_unit", "gyr_unit", "session.toml: data.gyr_unit is not a known key; did you mean 'gyro_unit'?"),
     ('gyro_unit = "rad/s"\n', "", "session.toml: data.gyro_unit is missing; there is: rad/s, deg/s"),
     ('"m/s^2"', '"m/s2"', "data.accel_unit = 'm/s2' is not known; did you mean 'm/s^2'?"),

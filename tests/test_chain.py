@@ -13,7 +13,7 @@ import pytest
 from commands import run
 from scipy.spatial.transform import Rotation
 
-from benchmarks.ur5_arm import UPRIGHT, UR5, write_ur5_session, write_urdf
+from benchmarks.ur5_arm import UPRIGHT, UR5, write_table, write_ur5_session, write_urdf
 from wepose_pin import (
     ImuSensor,
     OrientationSensor,
@@ -96,6 +96,12 @@ def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) ->
     np.testing.assert_allclose(both, q[:, 1] + q[:, 2], atol=np.deg2rad(1.0))
     (diagnostic,) = [d for d in tracked.summary["diagnostics"] if d["code"] == "sensors-missing"]
     assert diagnostic["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
+
+
+def test_open_joints_are_warned_of_beside_missing_sensors(tmp_path: Path) -> None:
+    write_table(arm := write_urdf(tmp_path))
+    diagnostics = track(made(arm, ["forearm_link"], 10.0)[0], model=arm).diagnostics
+    assert [d.severity for d in diagnostics if d.code == "sensors-missing"] == ["warning", "info"]
 
 
 def test_the_command_writes_joints_orientations_and_torques(urdf: Path, data: Path, tmp_path: Path) -> None:

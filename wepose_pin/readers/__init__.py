@@ -121,6 +121,9 @@ def _find_model(path: Path, top: TomlTable) -> str:
 
 
 def _read_phases(keys: TomlTable) -> dict[str, Intervals]:
+    if "still" in keys:  # of an earlier version
+        needed = "write static = [[from, to]], seconds in which the sensors lie on a table"
+        raise BadSession(f"{keys.at('still')} is called static now: {needed}")
     phases: dict[str, Intervals] = {}
     for name, value in keys.values.items():
         pairs: list[Any] = value if isinstance(value, list) else [None]
