@@ -102,6 +102,15 @@ def test_a_table_of_a_spreadsheet_may_be_a_text(name: str, capsys: pytest.Captur
     np.testing.assert_allclose(recording.sensors["torso"].gyro_S, GYRO, atol=0.006)
 
 
+def test_a_column_of_dates_is_named_where_the_rate_is_to_be_checked(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    names = ",".join(["timestamp", *(f"torso_{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])
+    time = [f"2026-03-12 08:00:{0.01 * k:09.6f}" for k in range(N)]
+    (tmp_path / "a.csv").write_text(names + "\n" + lines(time, values(0), ","))
+    assert "rate_hz = 100.0   # CHECK: 'timestamp' does not hold numbers" in info(capsys, tmp_path / "a.csv")
+
+
 def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Half a second is lost; and the counter never runs backwards."""
     names = ",".join(["t_us", *(f"torso_{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])

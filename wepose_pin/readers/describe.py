@@ -342,11 +342,12 @@ def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) ->
             break
     else:
         lines = () if arrays else read_first_lines(about.path)
+        missing = f"'{guess.times[0]}' does not hold numbers" if guess.times else "no column looks like time"
         if stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
             data["rate_hz"] = float(stated["rate"])
-            about.facts.append(f"no column looks like time; the file says '{stated[0]}'")
+            about.facts.append(f"{missing}; the file says '{stated[0]}'")
         else:
-            data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, "no column looks like time"
+            data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, missing
         return
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0

@@ -206,7 +206,7 @@ class ArmObserver:
     def _compute_std(self, i: int, p: np.ndarray, std: np.ndarray) -> float:
         """[m] of the hand against the shoulder: an error of a segment rotates what it carries, one of a length shifts.
 
-        As `covariance.compute_point_covariances`, whose hand is against the root: a robot's shoulder does not depend on
+        As `compute_point_covariances`, whose hand is against the root: a robot's shoulder does not depend on
         the trunk. The covariance of a segment is known here only as its mean over the axes.
         """
         base, upper, fore, hand = self._rows[i]
