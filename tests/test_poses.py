@@ -78,8 +78,9 @@ def test_another_pose_than_the_protocols_is_said_and_left_out() -> None:
 
 
 @pytest.mark.parametrize("condition", ['[[axis]]\nsegment = "head"', "[[pose]]\ndirections.head = [0, 0, 1]"])
-def test_a_pose_of_a_segment_without_a_sensor_is_one_line(tmp_path: Path, condition: str) -> None:
-    person, simulation = perform("t_pose")
-    (tmp_path / "own.toml").write_text(f'{condition}\nphase = "t_pose"\nstd_deg = 4.0\n', encoding="utf-8")
+def test_a_pose_of_a_segment_without_a_sensor_is_one_line(
+    half_minute: Recording, tmp_path: Path, condition: str
+) -> None:
+    (tmp_path / "own.toml").write_text(f'{condition}\nphase = "clasp"\nstd_deg = 4.0\n', encoding="utf-8")
     with pytest.raises(WeposeError, match="no sensor on head, which a pose or an axis is about"):
-        solve(person, simulation.recording(), str(tmp_path / "own.toml"))
+        calibrate(half_minute, protocol=str(tmp_path / "own.toml"))

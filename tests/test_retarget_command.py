@@ -89,7 +89,7 @@ def test_the_exit_code_says_that_no_robot_should_run_it(
     urdf = write_arm(tmp_path)
     hit = retargeting.SelfCollisions(3, "hand_0 and base_0 at 2.00 s", 10)
     monkeypatch.setattr("wepose_pin.retargeting.find_self_collisions", lambda *_: hit)
-    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"), "--no-view")
     assert code == 3
     assert "touch each other in 3 samples, first hand_0 and base_0 at 2.00 s" in " ".join(text.split())
     assert (tmp_path / "out" / "trajectory.parquet").is_file()
