@@ -263,6 +263,17 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
         assert np.sqrt(np.mean(by_std**2)) < 1.6
 
 
+@pytest.mark.parametrize("name", ["", "torso", "left_upper_arm", "right_forearm"])
+def test_a_sensor_that_is_stated_backwards_is_named(moving: Simulation, name: str) -> None:
+    """Turned about the vertical of the start pose, where gravity does not show it."""
+    recording, half_turn = moving.recording(), Rotation.from_rotvec([0.0, 0.0, np.pi])
+    backwards = {name: half_turn * Rotation.from_quat(recording.sensors[name].stated_quat_LS)} if name else {}
+    stated = {each: replace(recording.sensors[each], stated_quat_LS=quat.as_quat()) for each, quat in backwards.items()}
+    diagnostics = track(replace(recording, sensors={**recording.sensors, **stated})).diagnostics
+    found = {each.place: each.value for each in diagnostics if each.code == "mount-contradicted"}
+    assert found == {each: pytest.approx(np.pi, abs=0.3) for each in stated}
+
+
 @pytest.mark.parametrize("causal", [False, True])
 @pytest.mark.parametrize("lost", ["left_forearm", "right_upper_arm"])
 def test_a_sensor_that_is_lost_while_the_person_turns_is_found_again(

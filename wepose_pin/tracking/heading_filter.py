@@ -26,6 +26,8 @@ from scipy.special import expit, logit
 from .. import rotations
 from ..body import BodyModel
 from ..body.mounts import (
+    MOUNT_MOVED_STDS,
+    MOUNT_WARNING_DEG,
     PALM_SLIP_STD,
     SEGMENT_ATTITUDE_STD,
     StartPose,
@@ -34,6 +36,8 @@ from ..body.mounts import (
 from ..body.subject import Subject
 from ..body.table import HingeJoint
 from ..calibration import load_protocol
+from ..calibration.headings import LEAST_MISMATCH, LEAST_S, SAMPLES_HZ, estimate_heading
+from ..calibration.least_squares import LEAST_CORRELATION_S
 from ..errors import BadSession
 from ..filters.phases import SensorNoise
 from ..observations import LEAST_RATE_HZ, PointPath, find_hinges, find_joint_pairs, linearize_hinge, linearize_joint
@@ -76,6 +80,7 @@ CIRCLE = np.deg2rad(np.arange(-180.0, 180.0, 5.0))  # [rad]
 CELL_VAR = np.deg2rad(5.0) ** 2 / 12.0  # [rad²] of a heading between two of these
 PEAK = np.deg2rad(60.0)  # [rad] from the likeliest heading, as far as its peak extends
 TAIL = 4.0  # degrees of freedom of a hinge's error on that circle, whose distribution has long tails
+MOUNTS_S = 120.0  # [s] after the start pose whose accelerations show a turned mount; headings drift little by then
 # A heading may be feigned by no more than a share of the rms misfit; found by simulated people who walk, run, throw and
 # reach.
 LARGEST_COHERENT_SHARE = 0.5
@@ -235,7 +240,7 @@ class HeadingFilter:
         self.x, self.P = np.zeros(len(std)), np.diag(std**2)
         index = self.names.index
         self._pair_columns = []  # (17,) each: headings of its segments, joint; lever, force and delay near and far
-        self.x[c["lever"]] = levers
+        self.x[c["lever"]], self._levers = levers, (levers, lever_std)
         for i, pair in enumerate(self.pairs):
             near, far, lever = index(pair[0]), index(pair[1]), c["lever"][i]
             sides = [(*own, *c["force"][at], c["delay"][at]) for own, at in ((lever[:3], near), (lever[3:], far))]
@@ -255,6 +260,9 @@ class HeadingFilter:
         self._misfits = np.zeros((len(self.pairs), 16))
         # Whether a sensor has lost a sample in the last knot, and whether its tilt is lost since a loss.
         self._lost_before, self._tilt_lost = np.zeros((2, k), dtype=bool)
+        # Of the first `MOUNTS_S`: the sides of sensors (m, k, 3, 4) by their headings of the start pose, NaN where they
+        # are lost, and the variance (k,) [rad²] that drift gives these headings.
+        self._first_sides, self._first_drift_var = list[np.ndarray](), np.zeros(k)
         # Of a heading that is searched: its log-likelihood around the circle, whose zero is the estimate less `_turned`
         # [rad], and the sensor to which it is relative, a step nearer to the one that is best known.
         self._log_likelihood, self._turned = np.zeros((k, len(CIRCLE))), np.zeros(k)
@@ -303,6 +311,9 @@ class HeadingFilter:
         self.process, leaps = self._find_process(filters, lost, quat_WL)
         self.predict(self.process)
         unreliable, lost_now = lost | self._lost_before, lost  # after a loss the tilt may be wrong
+        if len(sides) and len(self._first_sides) * self.knot_s < MOUNTS_S:
+            self._first_sides.append(np.where(unreliable[:, None, None], np.nan, sides[..., :4]))
+            self._first_drift_var = np.nan_to_num(filters[0])
         order = self._find_searched(leaps)
         tilted, unreliable, lost = unreliable, unreliable | self._searched, lost | self._searched
         palms = self.palms if clasped.any() else None
@@ -531,6 +542,56 @@ class HeadingFilter:
             misfit = np.log1p(r**2 / (TAIL * r_var)) + np.log1p(excess**2 / (TAIL * RANGE_STD**2))
             total -= 0.5 * TAIL * misfit.reshape(m, g).sum(axis=0) / max(1.0, HINGE_CORRELATION_S * self.rate_hz)
         return total
+
+    def find_turned_mounts(self) -> dict[str, tuple[float, float]]:
+        """Find the sensors with a mount that is wrong by a rotation about the vertical of the start pose, which gravity
+        does not show: segment → that rotation [rad] and its limit.
+
+        Of two sensors that disagree the one is wrong whose rotation brings it nearer to more of its neighbours, or else
+        the one below.
+        """
+        turns = self._compare_neighbours()
+        wrong = {pair for pair, (turn, limit) in turns.items() if abs(turn) > limit}
+
+        def count_nearer(pair: tuple[str, str]) -> tuple[float, int, int]:
+            own = np.array([turn for (name, _), (turn, _) in turns.items() if name == pair[0]])
+            nearer = int(np.sum(np.abs(wrap_angle(own - turns[pair][0])) < np.abs(own)))
+            return nearer / len(own), nearer, self.names.index(pair[0])
+
+        turned = dict[str, tuple[float, float]]()
+        while wrong:
+            best = max(sorted(wrong), key=count_nearer)
+            turned[best[0]] = turns[best]
+            wrong = {pair for pair in wrong if best[0] not in pair}
+        return turned
+
+    def _compare_neighbours(self) -> dict[tuple[str, str], tuple[float, float]]:
+        """Return the rotation [rad] of a sensor against its neighbour by the accelerations of their joint, whatever is
+        stated, less that by their mounts, and the limit [rad] of what else may feign it.
+        """
+        turns = dict[tuple[str, str], tuple[float, float]]()
+        cov = self.start_cov + self.mount_cov + np.diag(self._first_drift_var)
+        # In units in which no two sensors agree better than `ACCELERATION_STD`.
+        unit, held = ACCELERATION_STD / LEAST_MISMATCH, LEAST_MISMATCH * np.sqrt(LEAST_CORRELATION_S * SAMPLES_HZ)
+        for (near, far), levers, lever_std in zip(self.pairs if self._first_sides else (), *self._levers, strict=False):
+            at = [self.names.index(name) for name in (near, far)]
+            sides = np.concatenate([first[:, at] for first in self._first_sides]) / unit
+            sides = sides[np.isfinite(sides).all(axis=(1, 2, 3))]
+            if len(sides) < LEAST_S * self.rate_hz:
+                continue
+            # Levers are near the usual ones, by one more sample each: a person who spins may seem to have any others.
+            sides[..., 0] += np.einsum("mkac,kc->mka", sides[..., 1:], levers.reshape(2, 3))
+            usual = np.zeros((2, 2, 3, 4))
+            usual[[0, 1], [0, 1], :, 1:] = held / lever_std * np.eye(3)
+            heading, std = estimate_heading(*np.concatenate([sides, usual]).swapaxes(0, 1))
+            # That is of independent observations; what is coherent in their misfit does not average out.
+            coherent = 2.0 * LARGEST_COHERENT_SHARE**2 * len(sides) / (LEAST_CORRELATION_S * SAMPLES_HZ)
+            std *= float(np.sqrt(1.0 + coherent))
+            limit = MOUNT_MOVED_STDS * float(np.sqrt([1.0, -1.0] @ cov[np.ix_(at, at)] @ [1.0, -1.0] + std**2))
+            turn, limit = float(wrap_angle(np.array(heading))), max(limit, float(np.deg2rad(MOUNT_WARNING_DEG)))
+            if MOUNT_MOVED_STDS * std < 0.5 * np.pi:  # else the opposite heading may explain them too
+                turns |= {(far, near): (turn, limit), (near, far): (-turn, limit)}
+        return turns
 
     def find_care(self, x: np.ndarray, P: np.ndarray) -> float:
         """Return the probability that the person took care in the start pose, by a state and its covariance.

@@ -271,6 +271,8 @@ class TrackSummary:
             yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING)
         if correction is None:
             return
+        for name, (turned, limit) in correction.filter.find_turned_mounts().items():
+            yield Diagnostic("mount-contradicted", WARNING, name, abs(turned), limit, {"variant": "turned"})
         start_var = np.diag(correction.filter.start_cov + correction.filter.mount_cov)
         for (name, turned_deg), variance in zip(correction.max_correction_deg.items(), start_var, strict=True):
             orientation = self.tracked.segments.orientation.get(name)
