@@ -345,10 +345,11 @@ class HeadingFilter:
 
         The heading variance of an orientation filter grows by the bias and the scale of its gyroscope too, which are
         states here. So its growth counts up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or
-        the gyroscope was saturated. What the filter has corrected of its heading and its bias is taken back.
+        the gyroscope was saturated. What the filter has corrected of its heading and its bias is taken back. A bias is
+        less certain where another axis of the sensor becomes vertical, up to what the filter knows of it by itself.
         """
         heading, rate = self._columns["heading"], self._columns["rate"]
-        gained_var, corrected, corrected_rate = (filters - self._last)[:3]
+        gained_var, corrected, corrected_rate, gained_rate_var = (filters - self._last)[:4]
         least = self._drift_psd * self.knot_s
         gained = np.maximum(gained_var, MIN_DRIFT_PSD * self.knot_s)
         known = np.isfinite(gained)
@@ -359,6 +360,8 @@ class HeadingFilter:
         change[heading], change[rate] = -np.nan_to_num(corrected), np.nan_to_num(corrected_rate)
         drift = np.where(leaps, gained, np.minimum(gained, least))
         variance[heading] += np.where(known, drift, UNKNOWN_DRIFT_PSD * self.knot_s)
+        room = filters[3] + self._rate_var - np.diag(self.P)[rate]
+        variance[rate] += np.nan_to_num(np.maximum(np.minimum(gained_rate_var, room), 0.0))
         quat = np.concatenate([quat_WL[:1] if self._last_quat is None else self._last_quat, quat_WL])
         self._last_quat = quat[-1:]
         turns = rotations.log(rotations.multiply(quat[1:], rotations.conjugate(quat[:-1])))
