@@ -35,7 +35,7 @@ _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
     """Solve for `q` (n, nq) with the measured orientations, segment → (n, 4) xyzw, or the nearest configuration.
 
-    An unmeasured segment is rigid with the one above. The limits of joints with one axis are kept.
+    An unmeasured segment is rigid with the one above. Joints with one axis stay within their limits.
     """
     return KinematicsSolver(model, quat_WL).solve(np.stack(list(quat_WL.values()), axis=1))
 

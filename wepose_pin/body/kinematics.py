@@ -361,8 +361,9 @@ def compute_point_covariances(
     points, stated = find_known_points(model, quat_WL), segment_cov
     segment_cov = {name: _limit_variance(cov) for name, cov in stated.items()}
     least = np.finfo(float).tiny
-    kept = {name: np.sqrt(cov[:, 2, 2] / np.maximum(stated[name][:, 2, 2], least)) for name, cov in segment_cov.items()}
-    heading_cov = {(a, b): kept[a] * kept[b] * shared for (a, b), shared in (heading_cov or {}).items()}
+    # Of each heading's standard deviation, the share that the limit leaves.
+    left = {name: np.sqrt(cov[:, 2, 2] / np.maximum(stated[name][:, 2, 2], least)) for name, cov in segment_cov.items()}
+    heading_cov = {(a, b): left[a] * left[b] * cov for (a, b), cov in (heading_cov or {}).items()}
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return {}

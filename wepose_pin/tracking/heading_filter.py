@@ -575,7 +575,7 @@ class HeadingFilter:
         turns = dict[tuple[str, str], tuple[float, float]]()
         cov = self.start_cov + self.mount_cov + np.diag(self._first_drift_var)
         # In units in which no two sensors agree better than `ACCELERATION_STD`.
-        unit, held = ACCELERATION_STD / LEAST_MISMATCH, LEAST_MISMATCH * np.sqrt(LEAST_CORRELATION_S * SAMPLES_HZ)
+        unit, weight = ACCELERATION_STD / LEAST_MISMATCH, LEAST_MISMATCH * np.sqrt(LEAST_CORRELATION_S * SAMPLES_HZ)
         for (near, far), levers, lever_std in zip(self.pairs if self._first_sides else (), *self._levers, strict=False):
             at = [self.names.index(name) for name in (near, far)]
             sides = np.concatenate([first[:, at] for first in self._first_sides]) / unit
@@ -585,7 +585,7 @@ class HeadingFilter:
             # Levers are near the usual ones, by one more sample each: a person who spins may seem to have any others.
             sides[..., 0] += np.einsum("mkac,kc->mka", sides[..., 1:], levers.reshape(2, 3))
             usual = np.zeros((2, 2, 3, 4))
-            usual[[0, 1], [0, 1], :, 1:] = held / lever_std * np.eye(3)
+            usual[[0, 1], [0, 1], :, 1:] = weight / lever_std * np.eye(3)
             heading, std = estimate_heading(*np.concatenate([sides, usual]).swapaxes(0, 1))
             # That is of independent observations; what is coherent in their misfit does not average out.
             coherent = 2.0 * LARGEST_COHERENT_SHARE**2 * len(sides) / (LEAST_CORRELATION_S * SAMPLES_HZ)

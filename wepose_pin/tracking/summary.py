@@ -234,7 +234,7 @@ class TrackSummary:
         if missing and lacking:
             facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
             yield Diagnostic("sensors-missing", INFO, facts=facts)
-        if self.undetermined_joints and (last.model.table.is_mechanism or (missing and not lacking)):
+        if (last.model.table.is_mechanism or (missing and not lacking)) and self.undetermined_joints:
             facts = {"variant": "joints", "joints": ", ".join(self.undetermined_joints)}
             yield Diagnostic("sensors-missing", WARNING, facts=facts)
         for segment, rms in self.residual_rms.items():
