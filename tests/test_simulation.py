@@ -50,7 +50,7 @@ def test_segments_keep_their_length(perfect: Simulation, side: str) -> None:
 def test_n_pose(perfect: Simulation) -> None:
     start = within(perfect, "start")
     for segment in SEGMENTS:
-        assert np.array_equal(perfect.quat_WL[segment][start], np.tile([0.0, 0.0, 0.0, 1.0], (start.sum(), 1)))
+        np.testing.assert_allclose(perfect.quat_WL[segment][start] - [0.0, 0.0, 0.0, 1.0], 0.0, atol=1e-15)
     arm = sum(SUBJECT[f"left_{part}"] for part in ("upper_arm", "forearm", "hand"))
     hand = [0.0, SUBJECT["shoulder_width"] / 2, SUBJECT["trunk"] - arm]
     np.testing.assert_allclose(perfect.points["left_palm"][0], hand, atol=1e-15)
@@ -71,12 +71,12 @@ def test_palms_coincide_in_the_clasp(perfect: Simulation) -> None:
     assert np.abs(turn).max() < 15
 
 
-def test_rests_and_start_are_exactly_still(perfect: Simulation) -> None:
+def test_rests_and_start_are_still(perfect: Simulation) -> None:
     still = within(perfect, "start", "rest")
     assert len(perfect.phases["rest"]) == 7
     for segment in SEGMENTS:
         assert np.abs(perfect.gyro_S[segment][still]).max() < 1e-12
-        np.testing.assert_allclose(np.linalg.norm(perfect.accel_S[segment][still], axis=1), G, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(perfect.accel_S[segment][still], axis=1), G, rtol=0, atol=1e-10)
     hand = perfect.points["right_palm"][within(perfect, "rest")]
     assert np.abs(hand - hand[0]).max() < 1e-12  # always the same point of the table
 

@@ -1,6 +1,6 @@
 """People with known truth, and the IMU data that their motion gives: `simulate` and `simulate_activity`.
 
-The motion is a closed form of continuous time, so that it is known exactly between the samples as well. That of a
+The motion is a closed form of continuous time; splines through it serve all sensors, each by its own clock. That of a
 protocol (`motion`) shares no code with the body room: what the tests compare against is written here and nowhere else.
 That of an activity of the whole body (`activities`) gives orientations; the body places the segments. Frames as
 everywhere: W is z up, x forward, y left, origin at the root of the trunk; each segment frame equals W in the N-pose.
@@ -12,11 +12,13 @@ the table, and sensors with noise and bias only. `Imperfections` add those of re
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, Range, check_arguments, check_names
@@ -27,7 +29,7 @@ from ..body.subject import BodyLength, Subject, population_subject
 from ..errors import BadOption, one_of
 from ..recording import ImuSensor, Recording, compute_mount
 from ..recording.clocks import bridge
-from ..rotations import compose, heading, log
+from ..rotations import compose, heading, log, unwrap_signs
 from .activities import ACTIVITIES as ACTIVITIES
 from .imperfections import GRAVITY, Device, draw_lost, jitter_time
 from .imperfections import IDEAL_PRESET as IDEAL_PRESET
@@ -40,7 +42,7 @@ from .imperfections import Imperfections as Imperfections
 from .imperfections import ImuNoise as ImuNoise
 from .motion import CIRCLING_POINT as CIRCLING_POINT
 from .motion import PARTS, SEGMENTS, STAND_S, BodyMotion, Motion
-from .people import E_Z, BodyPose, Flaws, SoftTissue
+from .people import E_Z, Flaws, SoftTissue
 from .people import SIDES as SIDES
 
 _MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
@@ -50,8 +52,7 @@ MEASURED_STD = 0.003  # [m] of each
 # [m] Shoulder width as 0.83 ± 0.03 of the biacromial breadth (`breadths` in calibration/anthropometry.toml): 12 mm of
 # 400 mm.
 PEOPLE_MEASURED_STD = 0.012
-_STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
-_STEPS = (0, -2, -1, 1, 2)  # of the poses that an acceleration follows from
+_GRID_HZ = 200.0  # at least, of the poses that a motion is interpolated between
 _MIDPOINTS = (np.arange(4) + 0.5) / 4.0  # of an interval's quarters, for its mean
 
 
@@ -117,31 +118,6 @@ class Simulation:
         )
 
 
-def _sample_sensor(
-    motion: BodyMotion, segment: str, R_LS: Rotation, tissue: SoftTissue, t: np.ndarray, poses: Sequence[BodyPose] = ()
-) -> tuple[Rotation, np.ndarray, np.ndarray]:
-    """Sample a sensor without errors of its own at the times `t` (n,) [s], by `_sample_poses`.
-
-    Return orientations (n) in W, specific force (n, 3) [m/s^2] in S, and rotation vectors of tissue (n, 3) [rad] in L.
-    """
-    poses = poses or _sample_poses(motion, t, [segment])
-    p_W, *others_W = (each.R_WL[segment].apply(motion.p_LS[segment]) + each.origins[segment] for each in poses)
-    # Differences to the middle first: for a static segment they are exactly zero.
-    far, near, near_after, far_after = (other_W - p_W for other_W in others_W)
-    accel_W = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
-    R_WL = poses[0].R_WL[segment]
-    soft_L = tissue(t, motion.moving_time(t, segment), poses[0], R_WL.inv().apply(accel_W))
-    R_WS = compose(R_WL, Rotation.from_rotvec(soft_L), R_LS)
-    return R_WS, R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L
-
-
-def _sample_poses(motion: BodyMotion, t: np.ndarray, segments: Sequence[str]) -> list[BodyPose]:
-    """Sample a motion at the times `t` (n,) [s], then two steps and one before, one and two after."""
-    # The sensor on the chest follows both arms.
-    first = SEGMENTS if "torso" in segments and motion.flaws.sizes.tissue_gain else ()
-    return [motion(t + step * _STENCIL_S, [*segments, *(first if step == 0 else ())]) for step in _STEPS]
-
-
 def simulate(
     lengths: Mapping[str, BodyLength],
     *,
@@ -177,7 +153,7 @@ def simulate(
     Simulation
         `recording()` is the `Recording` that a user would have, `truth()` the true `Pose`. Before the sensor's own
         errors, the product of all exp(gyro_S / rate) is the true orientation exactly; accel_S[k] is
-        R_WS[k]ᵀ (p̈ + g e_z), p̈ by central differences.
+        R_WS[k]ᵀ (p̈ + g e_z), p̈ that of splines through the positions at 200 Hz or more.
 
     Raises
     ------
@@ -254,6 +230,44 @@ def simulate_activity(
     return measure_motion(ACTIVITIES[activity](model, seconds, flaws), rate_hz, noise)
 
 
+class _SampledMotion:
+    """A motion by splines of fifth order through its poses on a grid: evaluated once for all sensors.
+
+    The grid holds the samples at `rate_hz`. Between them protocols are met to 1e-10 rad, 1e-10 m and 2e-5 m/s^2; what a
+    sensor measures is exactly the motion of the splines.
+    """
+
+    def __init__(self, motion: BodyMotion, begin: float, end: float, rate_hz: float) -> None:
+        grid_hz = rate_hz * np.ceil(_GRID_HZ / rate_hz)
+        grid = np.arange(np.floor(begin * grid_hz) - 1.0, np.ceil(end * grid_hz) + 2.0) / grid_hz
+        pose, self.moving_time = motion(grid), motion.moving_time
+        through = partial(make_interp_spline, grid, k=5)
+        self.points = {point: through(place_W) for point, place_W in pose.points.items()}
+        self._quat_WL, self._accel_W = {}, {}
+        for segment, p_LS in motion.p_LS.items():
+            R_WL = pose.R_WL[segment]
+            self._quat_WL[segment] = through(unwrap_signs(R_WL.as_quat()))
+            self._accel_W[segment] = through(R_WL.apply(p_LS) + pose.origins[segment]).derivative(2)
+
+    def rotate(self, t: np.ndarray, segments: Iterable[str] = SEGMENTS) -> dict[str, Rotation]:
+        """Return R_WL of segments at the times `t` (n,) [s]."""
+        return {segment: Rotation.from_quat(self._quat_WL[segment](t)) for segment in segments}
+
+    def sample(
+        self, segment: str, R_LS: Rotation, tissue: SoftTissue, t: np.ndarray
+    ) -> tuple[Rotation, np.ndarray, np.ndarray]:
+        """Sample a sensor without errors of its own at the times `t` (n,) [s].
+
+        Return orientations (n) in W, specific force (n, 3) [m/s^2] in S, rotation vectors of tissue (n, 3) [rad] in L.
+        """
+        accel_W = self._accel_W[segment](t)
+        R_WL = self.rotate(t, {*SEGMENTS, segment})
+        accel_L = R_WL[segment].inv().apply(accel_W)
+        soft_L = tissue(t, self.moving_time(t, segment), R_WL, accel_L)
+        R_WS = compose(R_WL[segment], Rotation.from_rotvec(soft_L), R_LS)
+        return R_WS, R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L
+
+
 def measure_motion(motion: BodyMotion, rate_hz: float, noise: ImuNoise) -> Simulation:
     """Measure a motion with a sensor on each segment of its `p_LS`."""
     sizes, rngs = motion.flaws.sizes, motion.flaws.rngs
@@ -261,32 +275,33 @@ def measure_motion(motion: BodyMotion, rate_hz: float, noise: ImuNoise) -> Simul
     time = np.arange(n) / rate_hz
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
 
-    own_clocks = any((sizes.clock_jitter, sizes.clock_offset, sizes.clock_drift_ppm))
-    start = motion(np.array([0.5 * STAND_S]), SEGMENTS)
+    own_times = {}
+    for segment in motion.p_LS:
+        own_time = jitter_time(rngs["clock_jitter"], time, rate_hz, sizes.clock_jitter)
+        own_time = own_time + sizes.clock_offset * rngs["clock_offset"].standard_normal()
+        own_times[segment] = own_time + 1e-6 * sizes.clock_drift_ppm * rngs["clock_drift"].standard_normal() * time
     # One sample more, before the first one, for the rate that ends there.
-    poses = [] if own_clocks else _sample_poses(motion, np.insert(time, 0, -1.0 / rate_hz), list(motion.p_LS))
-    true = motion(time, list(motion.p_LS))
+    begin = min(0.0, *(own_time[0] for own_time in own_times.values())) - 1.0 / rate_hz
+    end = max(time[-1], *(own_time[-1] for own_time in own_times.values()))
+    sampled = _SampledMotion(motion, begin, end, rate_hz)
+    start = sampled.rotate(np.array([0.5 * STAND_S]))
 
     sensors: defaultdict[str, dict] = defaultdict(dict)
-    for segment in motion.p_LS:
+    for segment, own_time in own_times.items():
         heading, tilt = rngs["strap"].uniform(0.0, 2.0 * np.pi), np.deg2rad(rngs["strap"].uniform(2.0, 10.0))
         R_LS = Rotation.from_rotvec(tilt * np.array((np.cos(heading), np.sin(heading), 0.0))) * N
         any_quat = rngs["mount"].standard_normal(4)  # uniform on the sphere
         if sizes.mount == "any":
             R_LS = Rotation.from_quat(any_quat / np.linalg.norm(any_quat))
-        own_time = jitter_time(rngs["clock_jitter"], time, rate_hz, sizes.clock_jitter)
-        own_time = own_time + sizes.clock_offset * rngs["clock_offset"].standard_normal()
-        own_time = own_time + 1e-6 * sizes.clock_drift_ppm * rngs["clock_drift"].standard_normal() * time
-
         place = -motion.p_LS[segment][2] / motion.lengths.get(segment, 1.0)
-        worn = motion, segment, R_LS, SoftTissue(segment, place, sizes, rngs, motion.end, start)
+        worn = segment, R_LS, SoftTissue(segment, place, sizes, rngs, motion.end, start)
         t = np.insert(own_time, 0, own_time[0] - 1.0 / rate_hz)
-        R_WS, force_S, soft_L = _sample_sensor(*worn, t, poses)
+        R_WS, force_S, soft_L = sampled.sample(*worn, t)
         rate_S = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat()) / np.diff(t)[:, None]
         force_S = force_S[1:]
         if sizes.accel_average:
             ages = sizes.accel_average / rate_hz * _MIDPOINTS
-            force_S = np.mean([_sample_sensor(*worn, own_time - age)[1] for age in ages], axis=0)
+            force_S = np.mean([sampled.sample(*worn, own_time - age)[1] for age in ages], axis=0)
 
         device = Device(rngs["device"], sizes, rngs["gyro_warm_up"])
         readings = device.measure(rate_S, force_S, rate_hz, noise, rngs["noise"])
@@ -299,8 +314,8 @@ def measure_motion(motion: BodyMotion, rate_hz: float, noise: ImuNoise) -> Simul
     return Simulation(
         time=time,
         rate_hz=rate_hz,
-        quat_WL={segment: true.R_WL[segment].as_quat() for segment in motion.p_LS},
-        points=true.points,
+        quat_WL={segment: R.as_quat() for segment, R in sampled.rotate(time, motion.p_LS).items()},
+        points={point: place_W(time) for point, place_W in sampled.points.items()},
         p_LS=dict(motion.p_LS),
         stated_mount=_MOUNT if sizes.mount == "stated" else None,
         lengths=dict(motion.lengths),

@@ -15,7 +15,7 @@ root, which the accelerometers measure.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from ..body import DEFAULT_BODY, BodyModel
 from ..body.kinematics import compute_link_poses
 from ..errors import BadOption
 from ..rotations import compose, turn_about
-from .motion import ARM, MARGIN_S, RAMP_S, SEGMENTS, STAND_S, BodyMotion, place_arm
+from .motion import ARM, MARGIN_S, RAMP_S, STAND_S, BodyMotion, place_arm
 from .people import E_Z, SIDES, BodyPose, Flaws
 from .signals import Process, make_pulse, make_step
 
@@ -162,14 +162,13 @@ class ArmTasks(Activity):
         lower = self.lengths[f"{side}_forearm"] + self.lengths[f"{side}_hand"]
         return np.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * np.cos(self.arms[side](t)[0][:, 3]))
 
-    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
+    def __call__(self, t: np.ndarray, /) -> BodyPose:
         flaws = self.flaws
         lean = self.trunk(t)[0]
         lean[:, :2] += flaws.sway_torso(t)
         R_WT = Rotation.from_rotvec(lean)
         pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
-        for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
-            y = SIDES[side]
+        for side, y in SIDES.items():
             typing = sum((make_pulse(t, a, b, 0.5) for a, b in self.arms[side].typing), np.zeros_like(t))
             angles = self.arms[side](t)[0] + _TYPING * typing[:, None] * self.tremble[side](t)
             swing = np.pad(angles[:, :2], ((0, 0), (0, 1)))
@@ -224,17 +223,15 @@ class WholeBodyActivity(Activity):
         """Return where the root is (n, 3) [m] in a world at rest."""
         return np.zeros((len(t), 3))
 
-    def __call__(self, t: np.ndarray, segments: Collection[str] = tuple(SIDES)) -> BodyPose:
-        sides = [side for side in SIDES if any(segment.startswith(side) for segment in segments)]
-        R_WL = self._orientations(t, sides)
+    def __call__(self, t: np.ndarray, /) -> BodyPose:
+        R_WL = self._orientations(t)
         p_W: dict[str, np.ndarray] = {}
         for link, (carrier, place) in self._carriers.items():
-            if not link.startswith(tuple(SIDES)) or link.startswith(tuple(sides)):
-                p_W[link] = p_W[carrier] + R_WL[carrier].apply(place) if carrier else np.tile(place, (len(t), 1))
+            p_W[link] = p_W[carrier] + R_WL[carrier].apply(place) if carrier else np.tile(place, (len(t), 1))
         origins = {segment: p_W[segment] for segment in R_WL}
-        points = {point: p_W[link] for point, link in self.model.point_frames.items() if link in p_W}
+        points = {point: p_W[link] for point, link in self.model.point_frames.items()}
         pose, girdle, R_WT = BodyPose(R_WL, points, origins), self.flaws.girdle, R_WL["torso"]
-        for side in sides if girdle.size else ():  # on shoulders that move
+        for side in SIDES if girdle.size else ():  # on shoulders that move
             R_arm = [R_WL[f"{side}_{part}"] for part in ARM]
             along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
             shoulder_T = girdle.place(SIDES[side], self.moving_time(t)) + girdle.displace(along_T, SIDES[side])
@@ -242,13 +239,12 @@ class WholeBodyActivity(Activity):
         root = self.root(t)
         return pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
 
-    def _orientations(self, t: np.ndarray, sides: Collection[str]) -> dict[str, Rotation]:
+    def _orientations(self, t: np.ndarray) -> dict[str, Rotation]:
         start = self.flaws.start_pose
         R_WT, R_WP, R_WH = (Rotation.from_rotvec(turn) for turn in self.trunk(t))
         R_WT, R_WH = R_WT * Rotation.from_rotvec(start.torso), R_WH * Rotation.from_rotvec(start.head)
         R_WL = {"torso": R_WT, "pelvis": R_WP, "head": R_WH}
-        for side in sides:
-            y = SIDES[side]
+        for side, y in SIDES.items():
             R_WU = compose(R_WT, self.shoulder(side, t)) * Rotation.from_rotvec(start.upper_arm[side])
             flexion, pronation = start.elbow[side]
             bent = self.arm(side, t)[:, 1] + flexion

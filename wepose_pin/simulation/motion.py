@@ -7,7 +7,7 @@ rotates about it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -77,8 +77,8 @@ class BodyMotion(ABC):
         self.phases: dict[str, list[tuple[float, float]]] = {"start": [(0.5, STAND_S - 0.5)]}
 
     @abstractmethod
-    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
-        """Return the exact pose at the times `t` (n,) [s], of the trunk and of the sides of these segments."""
+    def __call__(self, t: np.ndarray, /) -> BodyPose:
+        """Return the exact pose at the times `t` (n,) [s]."""
 
     def activity(self, t: np.ndarray) -> np.ndarray:
         """Return the activity (n,): 1 in free motion, 0 where the segments are static."""
@@ -314,7 +314,7 @@ class Motion(BodyMotion):
             raise BadOption(f"lengths: the {side} arm does not reach through the motion, by {1e3 * worst:.2g} mm")
         return shoulder_T, R_TU, flexion
 
-    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
+    def __call__(self, t: np.ndarray, /) -> BodyPose:
         flaws, start_pose = self.flaws, self.flaws.start_pose
         moving = self._motion_share(t)
         circling = sum((make_pulse(t, *circle.pulse) for circle in self.circles), np.zeros_like(t))
@@ -343,8 +343,8 @@ class Motion(BodyMotion):
             t_pose = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S)
 
         pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
-        for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
-            y, lead = SIDES[side], leads[side]
+        for side, y in SIDES.items():
+            lead = leads[side]
             hand_F = Rotation.identity(len(t))
             if flaws.sizes.wrists:
                 hand_F = flaws.wrists.rotate(y, t, moving, circling, distance)

@@ -14,6 +14,7 @@ from .signals import Process, RandomWalk, Streams, Sway, Wander, integrate_step,
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
 E_Z = np.array((0.0, 0.0, 1.0))
+Rotations = Mapping[str, Rotation]  # segment -> n rotations
 
 
 class BodyPose(NamedTuple):
@@ -323,11 +324,11 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     return about_z.inv().apply(log(compose(R, about_z.inv()).as_quat())), twist
 
 
-def _read_arm(pose: BodyPose, side: str) -> tuple[np.ndarray, ...]:
+def _read_arm(R_WL: Rotations, side: str) -> tuple[np.ndarray, ...]:
     """Return the upper arm's swing (n, 3) in its own frame, its elevation, flexion, twist and pronation (n,) [rad]."""
-    R_WU = pose.R_WL[f"{side}_upper_arm"]
-    swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
-    bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
+    R_WU = R_WL[f"{side}_upper_arm"]
+    swing, twist = _split(compose(R_WL["torso"].inv(), R_WU))
+    bend, pronation = _split(compose(R_WU.inv(), R_WL[f"{side}_forearm"]))
     elevation, flexion = (_round_off(np.linalg.norm(v, axis=1)) for v in (swing, bend))
     return swing, elevation, flexion, twist, pronation
 
@@ -335,11 +336,11 @@ def _read_arm(pose: BodyPose, side: str) -> tuple[np.ndarray, ...]:
 class SoftTissue:
     """The rotation of one sensor on its segment: by the joints, at random, by breath, creep and acceleration.
 
-    `place` is the sensor's, as a share of the segment's length; `start` has trunk and arms in the start pose.
+    `place` is the sensor's, as a share of the segment's length; `start` is R_WL of trunk and arms in the start pose.
     """
 
     def __init__(
-        self, segment: str, place: float, sizes: Imperfections, rngs: Streams, duration: float, start: BodyPose
+        self, segment: str, place: float, sizes: Imperfections, rngs: Streams, duration: float, start: Rotations
     ) -> None:
         side, _, part = segment.partition("_")
         self.side, self.part = (side, part) if part else ("", segment)
@@ -363,19 +364,19 @@ class SoftTissue:
         """Return this person's gain, with the draw k."""
         return sign * (GAINS[name].mean + self.draw[k] * GAINS[name].std)
 
-    def follow(self, pose: BodyPose) -> np.ndarray:
+    def follow(self, R_WL: Rotations) -> np.ndarray:
         """Return rotation vectors (n, 3) [rad] in L by the joints' rotation since the start pose, at people's size."""
-        turn = np.zeros((len(pose.R_WL["torso"]), 3))
+        turn = np.zeros((len(R_WL["torso"]), 3))
         if self.part in ("torso", "pelvis"):
-            flexion, first = (_split(each.R_WL["torso"])[0][:, 1] for each in (pose, self.start))
+            flexion, first = (_split(each["torso"])[0][:, 1] for each in (R_WL, self.start))
             turn[:, 1] = self._gain(f"{self.part}_flexion", 0) * (flexion - first)
         if self.part == "torso":
-            left, right = (_read_arm(pose, side)[1] - _read_arm(self.start, side)[1] for side in SIDES)
+            left, right = (_read_arm(R_WL, side)[1] - _read_arm(self.start, side)[1] for side in SIDES)
             turn[:, 1] += self._gain("torso_elevation", 1) * 0.5 * (left + right)
             turn[:, 0] = self._gain("torso_sides", 2) * (right - left)
             turn[:, 2] = self._gain("torso_sides", 3) * (right - left)
         elif self.part in ("upper_arm", "forearm"):
-            (swing, *angles), (_, *first_angles) = _read_arm(pose, self.side), _read_arm(self.start, self.side)
+            (swing, *angles), (_, *first_angles) = _read_arm(R_WL, self.side), _read_arm(self.start, self.side)
             _, bend, twist, pronation = (angle - first for angle, first in zip(angles, first_angles, strict=True))
             turn[:, 2] = -(self.lost + self.draw[0] * _TWIST_STD) * (twist if self.part == "upper_arm" else pronation)
             if self.part == "upper_arm":
@@ -389,12 +390,12 @@ class SoftTissue:
                 turn += self._gain("forearm_flexion", 1, self.sign[0]) * bend[:, None] * self.across
         return turn
 
-    def __call__(self, t: np.ndarray, moving_time: np.ndarray, pose: BodyPose, accel_L: np.ndarray) -> np.ndarray:
+    def __call__(self, t: np.ndarray, moving_time: np.ndarray, R_WL: Rotations, accel_L: np.ndarray) -> np.ndarray:
         """Return rotation vectors (n, 3) [rad] in L at the times `t` (n,) [s].
 
-        The random part stands where the segment does: `moving_time` (n,) [s] is how long it has moved. `pose` at `t` is
-        of the torso and what carries the sensor, of the torso's sensor of both arms. Limbs move below 5 Hz: the
-        low-pass of a strap at 15 Hz, which the literature gives, would change nothing of `accel_L` (n, 3) [m/s^2].
+        The random part stands where the segment does: `moving_time` (n,) [s] is how long it has moved. `R_WL` at `t`
+        is of trunk and arms. Limbs move below 5 Hz: the low-pass of a strap at 15 Hz, which the literature gives, would
+        change nothing of `accel_L` (n, 3) [m/s^2].
         """
         sizes, turn = self.sizes, np.zeros((len(t), 3))
         if sizes.tissue_random:
@@ -402,7 +403,7 @@ class SoftTissue:
             turn = self.random_rms * self.random(moving_time) + self.creep_rms * self.creep(t)
             turn = sizes.tissue_random * (turn - np.deg2rad(_WOBBLE_DEG) / GRAVITY * across)
         if sizes.tissue_gain:
-            turn = turn + sizes.tissue_gain * self.follow(pose)
+            turn = turn + sizes.tissue_gain * self.follow(R_WL)
         if sizes.sway and self.part == "torso":
             rate, phase = self.breath
             turn[:, 1] += sizes.sway * np.sqrt(2.0) * np.deg2rad(_BREATH_DEG) * np.sin(rate * t + phase)
