@@ -10,6 +10,7 @@ Ctrl-C and SIGTERM end a command; its output is whole, or there is none.
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import logging
 import os
@@ -33,6 +34,8 @@ def main(argv: list[str] | None = None) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # It warns of a home where it cannot keep its list of fonts, which changes nothing but its time.
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        # Most of what a command makes is code that it loads, which stays: Python would search it for garbage too often.
+        gc.set_threshold(20_000, 100)
         _catch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -61,6 +64,7 @@ def main(argv: list[str] | None = None) -> None:
     finally:
         if is_process:
             _catch_signals(signal.SIG_IGN)
+            gc.freeze()  # else Python searches all of it once more on its way out
     sys.exit(code)
 
 
