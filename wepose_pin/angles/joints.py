@@ -222,24 +222,30 @@ def choose_shoulder_sequence(pose: Pose) -> str:
     It is YXY, which the ISB recommends, where that is near the lock for no more than `MAX_NEAR_LOCK` of the samples. An
     arm that hangs is in its lock.
     """
-    shares = {}
+    counts = {}
     for sequence, names in SHOULDER_SEQUENCES.items():
         shoulders = {side: JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names) for side in SIDES}
-        angles = [_angles(pose, joint, side == "left") for side, joint in shoulders.items() if _is_known(pose, joint)]
-        shares[sequence] = max((float(np.mean(each.near_lock)) for each in angles), default=0.0)
-    return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=shares.__getitem__)
+        parts = [_decompose(pose, joint, side == "left") for side, joint in shoulders.items() if _is_known(pose, joint)]
+        counts[sequence] = max((np.count_nonzero(gimbal < NEAR_LOCK) for *_, gimbal in parts), default=0)
+    return "YXY" if counts["YXY"] <= MAX_NEAR_LOCK * len(pose.time) else min(counts, key=counts.__getitem__)
 
 
 def _is_known(pose: Pose, joint: Joint) -> bool:
     return {joint.proximal, joint.distal} <= {"world", *pose.quat_WL}
 
 
-def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
-    members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
+def _decompose(pose: Pose, joint: Joint, left: bool) -> tuple[np.ndarray, ...]:
+    """The m known samples as a mask (n,), the proximal frame (m, 4) in W, the rotation (m, 4), `euler.decompose`."""
+    members = {joint.proximal, joint.distal} - {"world"}
     known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
     quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
     quat = multiply(conjugate(quat_WP), quat_WD)
-    principal, gimbal = euler.decompose(quat, joint.sequence)
+    return known, quat_WP, quat, *euler.decompose(quat, joint.sequence)
+
+
+def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
+    members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
+    known, quat_WP, quat, principal, gimbal = _decompose(pose, joint, left)
     values = euler.follow((principal, gimbal), joint.sequence, NEAR_LOCK)
     std = None
     if all(segment in pose.segment_cov for segment in members):

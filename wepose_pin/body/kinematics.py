@@ -407,7 +407,7 @@ def compute_point_covariances(
             skew = np.zeros((n, 3, 3))
             skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
             skews[segment] = skew = skew - skew.swapaxes(1, 2)
-            cov += skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
+            cov -= skew @ segment_cov[segment] @ skew  # [v]×ᵀ = −[v]×
         for (near, far), shared in heading_cov.items():  # of errors about z
             if near in skews and far in skews:
                 outer = shared[:, None, None] * skews[near][:, :, 2, None] * skews[far][:, None, :, 2]

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from scipy.io import loadmat
 
 from ..errors import BadData, one_of
 from ..libraries import check_file, import_library, library_errors
@@ -99,6 +98,8 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
     Path → array (n,) or (n, k), or a single number, (). What is neither a number nor a struct of one element is passed
     over.
     """
+    from scipy.io import loadmat
+
     with library_errors(path, KIND):
         content = loadmat(path, simplify_cells=True)
     arrays: dict[str, np.ndarray] = {}
