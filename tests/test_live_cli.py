@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,14 +47,17 @@ def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_pa
     file = tmp_path / "a.mcap"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         listening.bind(("127.0.0.1", 0))
-        listening.settimeout(600.0)  # a new clone compiles first
+        listening.settimeout(1.0)
         command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"replay:{session}", "--no-page"]
         command += ["--record", str(file), "--speed", str(SPEED), "--output", f"udp:{listening.getsockname()[1]}"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        shown = {}
-        while len(shown) < 400:
-            message = json.loads(listening.recv(65536))
-            shown[message["t"]] = message["segments"]
+        shown, until = dict[float, dict[str, list[float]]](), time.monotonic() + 600.0  # a new clone compiles first
+        while not shown or max(shown) - min(shown) < 4.0:  # some poses are left out where the machine is busy
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < until
+            with contextlib.suppress(TimeoutError):
+                message = json.loads(listening.recv(65536))
+                shown[message["t"]] = message["segments"]
         process.send_signal(number)
         out, err = process.communicate(timeout=120)
         assert [line for line in err.splitlines() if "compiling the filters" not in line] == [], out
@@ -61,7 +66,7 @@ def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_pa
     times = log.recording.time[log.first : log.first + len(log.quat_WL)]
     # What a kill may cost is a second of the day, not of the replay.
     assert times[-1] >= max(shown) - (SPEED * 1.0 if number == signal.SIGKILL else 0.0)
-    for t, segments in list(shown.items())[:300:30]:
+    for t, segments in [(t, segments) for t, segments in shown.items() if t < min(shown) + 3.0][::30]:
         k = int(np.argmin(np.abs(times - t)))
         for i, name in enumerate(log.header["sensors"]):
             np.testing.assert_allclose(log.quat_WL[k, i], segments[name], atol=1e-6)

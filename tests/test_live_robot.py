@@ -279,7 +279,7 @@ class Receiver(threading.Thread):
                 self.messages.append(json.loads(self._socket.recv(65535)))
         self._socket.close()
 
-    def until(self, happens: Callable[[dict[str, Any]], bool], meanwhile: Callable[[], None] = lambda: None) -> int:
+    def until(self, happens: Callable[[dict[str, Any]], bool], meanwhile: Callable[[], object] = lambda: None) -> int:
         """Wait until such a message comes, after all that have come; return its row."""
         row, end = len(self.messages), time.monotonic() + 600.0  # a new clone compiles first
         while True:
@@ -386,7 +386,10 @@ def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, r
     follow.write_text(f'robot = "{urdf.name}"\narm = "right"\nto = {receiver.port}\n', encoding="utf-8")
     command += ["--speed", "2", "--robot", str(follow)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    receiver.until(lambda m: m["state"] == "approach" and max(map(abs, m["velocity"])) > 0.2)
+    receiver.until(
+        lambda m: m["state"] == "approach" and max(map(abs, m["velocity"])) > 0.2,
+        lambda: process.poll() is None or pytest.fail(str(process.communicate())),
+    )
     assert process.stdout is not None
     address = next(found[0] for line in process.stdout if (found := re.search(r"http://\S+", line)))
     with urllib.request.urlopen(address, timeout=60) as page:  # which draws the robot beside the person
