@@ -245,9 +245,8 @@ class _SampledMotion:
         self.points = {point: through(place_W) for point, place_W in pose.points.items()}
         self._quat_WL, self._accel_W = {}, {}
         for segment, p_LS in motion.p_LS.items():
-            R_WL = pose.R_WL[segment]
-            self._quat_WL[segment] = through(unwrap_signs(R_WL.as_quat()))
-            self._accel_W[segment] = through(R_WL.apply(p_LS) + pose.origins[segment]).derivative(2)
+            self._quat_WL[segment] = through(unwrap_signs(pose.R_WL[segment].as_quat()))
+            self._accel_W[segment] = through(pose.R_WL[segment].apply(p_LS) + pose.origins[segment]).derivative(2)
 
     def rotate(self, t: np.ndarray, segments: Iterable[str] = SEGMENTS) -> dict[str, Rotation]:
         """Return R_WL of segments at the times `t` (n,) [s]."""
@@ -262,8 +261,7 @@ class _SampledMotion:
         """
         accel_W = self._accel_W[segment](t)
         R_WL = self.rotate(t, {*SEGMENTS, segment})
-        accel_L = R_WL[segment].inv().apply(accel_W)
-        soft_L = tissue(t, self.moving_time(t, segment), R_WL, accel_L)
+        soft_L = tissue(t, self.moving_time(t, segment), R_WL, R_WL[segment].inv().apply(accel_W))
         R_WS = compose(R_WL[segment], Rotation.from_rotvec(soft_L), R_LS)
         return R_WS, R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L
 

@@ -290,7 +290,7 @@ class Motion(BodyMotion):
 
         def bend(flexion: np.ndarray) -> np.ndarray:
             """Palm (n, 3) [m] in the upper arm, from the shoulder."""
-            return flaws.elbow_joint.rotate_vectors(y, flexion, hand.pronation, hand.palm_F) - upper * E_Z
+            return flaws.elbow_joint.rotate(y, flexion, hand.pronation).apply(hand.palm_F) - upper * E_Z
 
         def opening(palm: np.ndarray) -> np.ndarray:
             """Angle (n,) [rad] at the elbow, 0 where the arm is straight, from the palm seen from the shoulder."""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..rotations import compose, log, turn_about
 from .imperfections import GRAVITY, Imperfections
-from .signals import Process, RandomWalk, Streams, Sway, Wander, integrate_step, rotate_about
+from .signals import Process, RandomWalk, Streams, Sway, Wander, integrate_step
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
 E_Z = np.array((0.0, 0.0, 1.0))
@@ -179,23 +179,13 @@ class Elbow:
         self.abduction = sizes.elbow * np.deg2rad(_ABDUCTION_DEG) * np.sqrt(2.0)
         self.phase = rngs["elbow_abduction"].uniform(0.0, 2.0 * np.pi)
 
-    def _angles(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> np.ndarray:
-        """Return angles (n, 4) [rad] about x, y, x, z, one after the other, of the side y."""
+    def rotate(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> Rotation:
+        """Return R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
         inwards = (self.carrying - self.neutral) * (1.0 - y * pronation / np.deg2rad(_SUPINATION_DEG))
         varying = self.abduction * np.sin(2.0 * np.pi * flexion / np.deg2rad(_ABDUCTION_PERIOD_DEG) + self.phase)
         half = 0.5 * self.carrying
         humerus = np.full_like(flexion, y * half)
-        return np.column_stack((humerus, -flexion, y * (half - inwards + varying), pronation))
-
-    def rotate(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> Rotation:
-        """Return R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
-        return turn_about("XYXZ", self._angles(y, flexion, pronation))
-
-    def rotate_vectors(self, y: float, flexion: np.ndarray, pronation: np.ndarray, vectors_F: np.ndarray) -> np.ndarray:
-        """Return vectors (n, 3) in the upper arm from those in the forearm: `rotate`, made for speed."""
-        x, flex, abduct, pronate = self._angles(y, flexion, pronation).T
-        vectors = rotate_about(0, abduct, rotate_about(2, pronate, vectors_F))
-        return rotate_about(0, x, rotate_about(1, flex, vectors))
+        return turn_about("XYXZ", np.column_stack((humerus, -flexion, y * (half - inwards + varying), pronation)))
 
 
 class Wrists:
@@ -255,10 +245,9 @@ def compute_girdle(along_T: np.ndarray, side: float) -> np.ndarray:
 
     def locate(clavicle_deg: np.ndarray, scapula_deg: np.ndarray) -> np.ndarray:
         """Return the place (n, 3) [m] of the shoulder's centre by angles (k, n) of clavicle and scapula."""
-        clavicle, scapula = np.deg2rad(clavicle_deg), np.deg2rad(scapula_deg)
-        outer_end = rotate_about(1, clavicle[0], rotate_about(2, clavicle[1], np.array((_CLAVICLE_LENGTH, 0.0, 0.0))))
-        about_x = rotate_about(0, scapula[2], _AC_TO_GH_SCAPULA)
-        return outer_end + rotate_about(1, scapula[0], rotate_about(2, scapula[1], about_x))
+        clavicle, scapula = (np.deg2rad(angles.T) for angles in (clavicle_deg, scapula_deg))
+        outer_end = turn_about("YZ", clavicle).apply((_CLAVICLE_LENGTH, 0.0, 0.0))
+        return outer_end + turn_about("YZX", scapula).apply(_AC_TO_GH_SCAPULA)
 
     def angles_deg(rows: np.ndarray) -> np.ndarray:
         constant, by_plane, by_elevation, by_rest, rest = (column[:, None] for column in rows.T)

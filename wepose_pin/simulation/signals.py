@@ -88,14 +88,3 @@ class Sway:
         """Angles (n, 2) [rad]."""
         waves = np.sin(self.omega * t[:, None, None] + self.phase) / self.omega
         return waves.sum(axis=2) / np.sqrt(3.0)  # each wave has the mean square 1/2, there are six
-
-
-def rotate_about(axis: int, angle: np.ndarray | float, vectors: np.ndarray) -> np.ndarray:
-    """Rotate vectors (n, 3), or one (3,), about x, y or z (0, 1, 2) by the angles (n,) [rad], or one."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    cos, sin = np.cos(angle), np.sin(angle)
-    a, b = vectors[..., i], vectors[..., j]
-    first = cos * a - sin * b
-    rotated = np.empty((*first.shape, 3))
-    rotated[..., axis], rotated[..., i], rotated[..., j] = vectors[..., axis], first, sin * a + cos * b
-    return rotated
