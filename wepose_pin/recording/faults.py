@@ -111,10 +111,7 @@ def check_sensors(
 
 def check_arrays(place: str, rate_hz: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Raise `BadData` where a sensor does not measure; `samples`: sensor → gyro and accel (n, 3), all numbers."""
-    floats = {name: [np.ascontiguousarray(each, dtype=float) for each in arrays] for name, arrays in samples.items()}
-    if not any(_may_have_faults(values) for arrays in floats.values() for values in arrays):
-        return
-    times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in floats.items()}
+    times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in samples.items()}
     for name, (fault, *_) in find_faults(times).items():
         text = f"{place}{name}{': ' * bool(name)}{fault.describe(max(fault.first, 0.0))}"
         whole = fault.first < 0.0 and fault.last >= times[name][0][-1]
@@ -129,9 +126,9 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     """
     faults: dict[str, list[Fault]] = {}
     for name, (time, *values) in samples.items():
-        gyro_S, accel_S = map(np.ascontiguousarray, values)
-        if not (_may_have_faults(gyro_S) or _may_have_faults(accel_S)):
+        if len(time) < FROZEN_SAMPLES:
             continue
+        gyro_S, accel_S = (np.ascontiguousarray(each, dtype=float) for each in values)
         own, covered = list[Fault](), np.zeros(len(time), dtype=bool)
         before = float(np.nextafter(time[0], -np.inf))  # the first sample is faulty, too
         for signals, signal in ((GYRO, gyro_S), (ACCEL, accel_S)):
@@ -177,6 +174,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
 
 def _find_dead_axis(time: np.ndarray, signal: np.ndarray, accel_S: np.ndarray) -> tuple[int, int] | None:
     """Find an axis of a signal (n, 3) that never changes from a row on, while the sensor moves; return both."""
+    if not (signal[-DEAD_ROWS - 1 :] == signal[-1]).all(axis=0).any():
+        return None
     differs = np.vstack([np.ones(3, dtype=bool), signal[:-1] != signal[-1]])
     begins = len(time) - 1 - np.argmax(differs[::-1], axis=0)  # rows from which the axes have their last values
     axis, row = int(np.argmin(begins)), int(begins.min())
@@ -194,27 +193,8 @@ def _find_dead_axis(time: np.ndarray, signal: np.ndarray, accel_S: np.ndarray) -
 
 def _mark_repeats(*signals: np.ndarray) -> np.ndarray:
     """Mark the rows (n,) in which all signals (n, 3) repeat the row before."""
-    changes = np.logical_or.reduce([signal[1:] != signal[:-1] for signal in signals]).any(axis=1)
-    return np.concatenate([[False], ~changes])
-
-
-@kernel
-def _may_have_faults(values):  # type: ignore[no-untyped-def]
-    """Return whether an axis may be dead at the end, or `FROZEN_SAMPLES` rows (3,) are the same: few signals do."""
-    end = len(values) - 1
-    middle, begin = max(0, end - DEAD_ROWS // 2), max(0, end - DEAD_ROWS)
-    for k in range(3):
-        if end > 0 and values[begin, k] == values[middle, k] == values[end, k]:
-            return True
-    for row in range(0, len(values), FROZEN_SAMPLES):  # so many rows in a row have one of these
-        first = last = row
-        while first > 0 and is_same(values[first - 1], values[row]):
-            first -= 1
-        while last < end and is_same(values[last + 1], values[row]):
-            last += 1
-        if last - first >= FROZEN_SAMPLES - 1:
-            return True
-    return False
+    axes = [axis for signal in signals for axis in (signal[1:] == signal[:-1]).T]  # ten times as fast as `all(axis=1)`
+    return np.concatenate([[False], np.logical_and.reduce(axes)])
 
 
 @kernel

@@ -101,5 +101,5 @@ def select_interval(
 
 def find_runs(which: np.ndarray) -> list[tuple[int, int]]:
     """Find the runs of true values; returns the first and one past the last index of each."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    edges = np.flatnonzero(np.diff(which, prepend=False, append=False))
+    return [(a, b) for a, b in edges.reshape(-1, 2).tolist()]
