@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 
 # No fastmath: the same bits from a batch, from a sample at a time and from a bank of sensors need strict IEEE steps.
 # What it would merge, a kernel merges itself where it counts (`fma`).
-# The numpy error model spares each division a branch; nogil lets several sensors run in threads.
+# The numpy error model spares each division a branch; nogil lets page and robot go on in their threads.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 # A function that allocates nothing needs no reference counts, but numba leaves some atomic ones in, several a sample.
 # Its option has no public name: without it kernels are slower, with the same results.

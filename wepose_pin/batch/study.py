@@ -31,7 +31,6 @@ import polars as pl
 from ..commands.options import parse
 from ..documents import whole_file
 from ..errors import BadData, BadOption, ExistingOutput, LostWorker, WeposeError, reason
-from ..filters.base import count_processors
 from ..writers.result import as_json, code, file_hashes, list_named_files
 from .plan import STEPS, Item, is_remote, open_filesystem, read_plan, write_words
 
@@ -41,7 +40,7 @@ DONE, FAILED, CHANGED = "done", "failed", "changed"  # status of an item
 # Columns of every row, before those of its steps.
 _COMMON = dict.fromkeys(("item", "session", "subject", "status", "error", "message"), pl.String)
 # Processes of items share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
-_ONE_THREAD = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
+_ONE_THREAD = "NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
 
 Row = dict[str, Any]  # of the table: column → value
 RunItem = Callable[[Item], Row]
@@ -81,12 +80,13 @@ def run_batch(
     plan = read_plan(plan_file, place)
     planned = [item for items in plan for item in items]
     rows: dict[str, Row] = {}
-    count = workers or count_processors()
+    if not workers:  # Linux: a container or taskset may have fewer than the machine
+        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with _create_study(out):
         progress("starting workers", 0.0)
         for items in plan:  # sessions need the calibrations
             run = partial(run_item, place=place, force=force)
-            rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, count)
+            rows_done = _run_on_scheduler(run, items, scheduler) if scheduler else _run_here(run, items, workers)
             with contextlib.closing(rows_done) as done:
                 for item, row in done:
                     rows[item.name] = {"item": item.name, "session": item.session, "subject": item.subject} | row

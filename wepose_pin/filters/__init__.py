@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +24,7 @@ from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 from .amekf import AMEKF
 from .amekf import AmekfParams as AmekfParams
 from .base import Orientation as Orientation
-from .base import OrientationFilter, count_processors, make_orientation
+from .base import OrientationFilter, make_orientation
 from .base import join_orientations as join_orientations
 from .complementary import GDC, NCF
 from .complementary import GdcParams as GdcParams
@@ -113,20 +112,11 @@ class SensorFilters:
 
     def push(self, chunk: Recording) -> dict[str, Orientation]:
         """Filter a chunk; `BadData`: the start phase has no gravity."""
-
-        def run(name: str) -> Orientation:
-            return self._run_chunk(name, chunk.imus[name], chunk.rate_hz)
-
-        threads = min(count_processors(), len(self.names))
-        if threads > 1:  # compiled runs release the interpreter's lock
-            with ThreadPoolExecutor(threads) as pool:
-                orientations = list(pool.map(run, self.names))
-        else:
-            orientations = [run(name) for name in self.names]
-        for i, each in enumerate(orientations):
+        orientations = {name: self._run_chunk(name, chunk.imus[name], chunk.rate_hz) for name in self.names}
+        for i, each in enumerate(orientations.values()):
             for name, values in each.sampled().items():
                 getattr(self._now, name)[i] = values[-1] if len(values) else getattr(self._now, name)[i]
-        return dict(zip(self.names, orientations, strict=True))
+        return orientations
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_VS` (k, 4).

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -173,11 +172,3 @@ def into_sensor(R, P, more, more_heading, out):  # type: ignore[no-untyped-def]
         out[i, i] = fma(a, u, fma(b, v, fma(c, w, more)))
         for j in range(i):
             out[i, j] = out[j, i] = fma(R[0, j], u, fma(R[1, j], v, R[2, j] * w))
-
-
-def count_processors() -> int:
-    """Return the number of processors that this process may use, or WEPOSE_THREADS where that is set."""
-    if (stated := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
-        return max(1, int(stated))
-    # Linux: a container or taskset may have fewer than the machine.
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
