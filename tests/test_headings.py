@@ -24,7 +24,7 @@ LIMB = ("torso", "right_upper_arm", "right_forearm")
 @pytest.fixture(scope="module")
 def made() -> tuple[Simulation, Subject]:
     person = simulate_person(4)
-    simulation = simulate(person.lengths, seed=4, noise=wp.NOISE_FREE, clasp_s=40.0, circles=4)
+    simulation = simulate(person.lengths, seed=4, noise=wp.NOISE_FREE, clasp_s=20.0, circles=2)
     mounts = dict.fromkeys(simulation.quat_WL, np.array([0.0, 0.0, 0.0, 1.0]))
     return simulation, replace(person.prior, lengths=person.lengths, mounts=mounts, hinges=HINGES, girdles=RIGID)
 
@@ -43,7 +43,7 @@ def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
 
 def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject]) -> None:
     simulation, subject = made
-    recording = drifting(simulation, {"right_forearm": 8.0})
+    recording = drifting(simulation, {"right_forearm": 16.0})
     errors = {}
     for open_loop in (True, False):
         pose = track(recording, subject, open_loop=open_loop)
@@ -64,7 +64,7 @@ def elbow_rms(pose: wp.TrackResult) -> float:
 def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulation, Subject]) -> None:
     """Axes as the table has them where none is calibrated, and without the torso that the hands would need."""
     simulation, subject = made
-    recording = drifting(simulation, {"right_forearm": 8.0})
+    recording = drifting(simulation, {"right_forearm": 24.0})
     recording = replace(recording, phases={"start": recording.phases["start"]})
     fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
     alone = replace(recording, sensors={n: s for n, s in recording.sensors.items() if "forearm" not in n})
@@ -77,7 +77,7 @@ def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulatio
 def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simulation, Subject]) -> None:
     """A phase that goes on into the circles, in which the palms are half a metre apart, is one without them."""
     simulation, subject = made
-    recording = drifting(simulation, {"right_forearm": 8.0})
+    recording = drifting(simulation, {"right_forearm": 16.0})
     start, clasp, circles = recording.phases["start"], recording.phases["clasp"], simulation.phases["circles"]
     only, longer, alone = (
         track(replace(recording, phases={"start": start, "clasp": spans}), replace(subject, hinges={}))
@@ -118,7 +118,7 @@ def test_a_marked_clasp_of_two_seconds_brings_a_turned_arm_back_within_one(made:
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     """Joined hands bound the drift; of a mount's heading that is off they say nothing."""
     noise = wp.ImuNoise(gyro_density=40.0 * wp.ImuNoise().gyro_density)
-    simulation = simulate(simulate_person(4).lengths, seed=4, noise=noise, clasp_s=40.0, circles=2)
+    simulation = simulate(simulate_person(4).lengths, seed=4, noise=noise, clasp_s=20.0, circles=1)
     recording = simulation.recording()
     average = simulate_person(4).prior
     order = (*LENGTHS, *mount_rows("torso", "right_forearm"))
@@ -174,7 +174,7 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
 
 def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simulation, Subject]) -> None:
     simulation, subject = made
-    recording = drifting(simulation, {"right_forearm": 8.0}).cut(slice(0, 3000))
+    recording = drifting(simulation, {"right_forearm": 16.0}).cut(slice(0, 3000))
     recording = replace(recording, phases={"start": recording.phases["start"]})
     skew = Hinge(np.array([np.sin(0.2), np.cos(0.2), 0.0]), np.deg2rad(2.0))
     subject = replace(subject, hinges=dict.fromkeys(HINGES, skew))
@@ -221,7 +221,7 @@ def test_headings_known_from_each_other_are_uncertain_together(made: tuple[Simul
 
 @pytest.fixture(scope="module")
 def moving() -> Simulation:
-    return simulate(simulate_person(3).lengths, seed=3, imperfections=wp.MILD_PRESET, clasp_s=60.0, circles=2)
+    return simulate(simulate_person(3).lengths, seed=3, imperfections=wp.MILD_PRESET, clasp_s=40.0, circles=1)
 
 
 def heading_errors(simulation: Simulation, tracked: wp.TrackResult, from_s: float) -> dict[tuple[str, str], np.ndarray]:
@@ -237,12 +237,12 @@ def heading_errors(simulation: Simulation, tracked: wp.TrackResult, from_s: floa
 
 @pytest.mark.parametrize("causal", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving: Simulation, causal: bool) -> None:
-    """The gyroscope of the right forearm turns about the vertical by 0.15 deg/s from the end of the start pose on."""
+    """The gyroscope of the right forearm turns about the vertical by 0.25 deg/s from the end of the start pose on."""
     recording = moving.recording()
     recording = replace(recording, phases={"start": recording.phases["start"]})
     after = recording.time > recording.phases["start"][0][1]
     up_S = Rotation.from_quat(moving.quat_WS["right_forearm"]).inv().apply([0.0, 0.0, 1.0])
-    recording.sensors["right_forearm"].gyro_S[:] += np.deg2rad(0.15) * after[:, None] * up_S
+    recording.sensors["right_forearm"].gyro_S[:] += np.deg2rad(0.25) * after[:, None] * up_S
     rms = {}
     for open_loop in (True, False):
         tracked = track(recording, open_loop=open_loop, causal=causal)
@@ -308,7 +308,7 @@ def test_a_sensor_that_is_lost_while_the_person_turns_is_found_again(
 @pytest.mark.parametrize("causal", [False, True])
 def test_arms_that_hang_still_stay_as_the_filter_has_them(moving: Simulation, causal: bool) -> None:
     rng = np.random.default_rng(1)
-    n = 6000
+    n = 4000
     sensors = {
         name: ImuSensor(
             rng.normal(0.0, 2e-3, (n, 3)), sensor.accel_S[200] + rng.normal(0.0, 0.02, (n, 3)), sensor.stated_quat_LS

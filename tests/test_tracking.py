@@ -15,8 +15,8 @@ from wepose_pin.simulation import Person, simulate
 
 
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
-    """1 kHz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
-    simulation = simulate(person.lengths, seed=5, rate_hz=1000.0, noise=wp.NOISE_FREE, clasp_s=6.0, circles=1)
+    """500 Hz, no noise, the true lengths: what is left is the filter's and the alignment's own error."""
+    simulation = simulate(person.lengths, seed=5, rate_hz=500.0, noise=wp.NOISE_FREE, clasp_s=6.0, circles=1)
     subject = replace(population_subject(), lengths=person.lengths, girdles=simulation.girdles)
     # What observes headings in motion allows for people's errors: it is not as exact as this world, 0.1 deg.
     for open_loop, most_deg in ((True, 0.05), (False, 0.1)):
