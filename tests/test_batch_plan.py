@@ -15,12 +15,12 @@ STEPS = "[steps.calibrate]\n[steps.track]\n"
 def folder(tmp_path: Path) -> Path:
     for name in ("anna/one", "anna/two", "ben/one"):
         (tmp_path / name).mkdir(parents=True)
-        (tmp_path / name / "session.toml").write_text("")
+        (tmp_path / name / "session.toml").write_text("[")
     return tmp_path
 
 
 def plan(folder: Path, text: str) -> int:
-    """The exit code of `wepose batch`; 3: the items ran, and failed, as their sessions are empty."""
+    """The exit code of `wepose batch`; 3: the items ran, and failed, as their sessions are no TOML."""
     (folder / "plan.toml").write_text(text)
     return run("batch", folder / "plan.toml", "-o", folder / "out", "--workers", 1)
 
