@@ -12,7 +12,7 @@ demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 
 # Compiled once: without bytecode each worker, and each command that a test runs, compiles all files anew.
 test test-all: export PYTHONDONTWRITEBYTECODE :=
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)   # many tests wait for something
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)   # some tests wait for something
 test: $(READY)            ## what must pass before a commit: minutes
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -26,9 +27,10 @@ for line in {lines!r}:
 def run(folder: Path, *lines: str) -> str:
     """What commands print, in a process in which the example is installed."""
     shutil.copytree(EXAMPLE, folder / "source")
-    target = ["--target", folder / "site", folder / "source"]
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, *target], check=True)
+    build = [sys.executable, "-c", "from setuptools.build_meta import build_wheel; build_wheel('..')"]
+    subprocess.run(build, cwd=folder / "source", capture_output=True, check=True)
+    (wheel,) = folder.glob("*.whl")
+    ZipFile(wheel).extractall(folder / "site")  # as pip does, in a third of the time
     code = f"import sys; sys.path.insert(0, 'site')\n{RUN.format(lines=lines)}"
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
