@@ -103,7 +103,7 @@ class GuidedPerson:
 class PersonSource(Source):
     """A source with a clock of its own: the person acts as fast as the guide takes samples."""
 
-    def __init__(self, person: GuidedPerson, step_s: float = 0.05) -> None:
+    def __init__(self, person: GuidedPerson, step_s: float = 0.1) -> None:
         super().__init__(person.worn, RATE_HZ)
         self.person = person
         self._rows, self._now = round(step_s * RATE_HZ), 0.0
