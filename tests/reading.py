@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from html import unescape
-from pathlib import Path
-
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 def without_frame(page: str) -> str:
@@ -48,23 +43,3 @@ def is_self_contained(page: str) -> bool:
     return (
         "default-src 'none'" in page.split("<title>")[0] and not loads and "<script" not in own and "nan" not in shown
     )
-
-
-def browse(page: Path, *options: str, at: str = "", milliseconds: int = 3000) -> str:
-    """What a headless browser prints of a page at an address such as ``#t=12``, after so many milliseconds."""
-    assert BROWSER is not None
-    return subprocess.run(
-        [
-            BROWSER,
-            *"--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking".split(),
-            *"--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=600,450".split(),
-            f"--user-data-dir={page.parent / 'profile'}",
-            f"--virtual-time-budget={milliseconds}",
-            *options,
-            page.as_uri() + at,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    ).stdout

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import BROWSER, Browser
 from commands import run
-from PIL import Image
-from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
+from reading import captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
@@ -202,11 +202,15 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
 def test_in_a_browser_it_has_its_sections_light_and_dark(page: str, tmp_path: Path) -> None:
     file = tmp_path / "report.html"
     file.write_text(page, encoding="utf-8")
-    assert headings(browse(file, "--dump-dom")) == SECTIONS
-    corner = {}
-    for scheme, number in (("dark", 0), ("light", 1)):
-        picture = tmp_path / f"{scheme}.png"
-        browse(file, f"--blink-settings=preferredColorScheme={number}", f"--screenshot={picture}")
-        corner[scheme] = np.asarray(Image.open(picture).convert("L"))[5, 5]
-    assert corner["dark"] < 60
-    assert corner["light"] > 250
+    browser, corner = Browser(600, 450), {}
+    try:
+        browser.go(file.as_uri())
+        browser.wait("document.querySelector('h2') && document.readyState === 'complete'")
+        assert headings(browser.run("document.documentElement.outerHTML")) == SECTIONS
+        for scheme in ("dark", "light"):
+            browser.emulate(prefers_color_scheme=scheme)
+            corner[scheme] = browser.picture()[5, 5]
+    finally:
+        browser.close()
+    assert corner["dark"].max() < 60
+    assert corner["light"].min() > 250
