@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,17 @@ from wepose_pin.writers import write_session
 @pytest.fixture(scope="module")
 def result(half_minute: wp.Recording) -> wp.TrackResult:
     return wp.track(half_minute)
+
+
+@pytest.fixture
+def out(saved: Path, tmp_path: Path) -> Path:
+    """A folder with a result."""
+    return Path(shutil.copytree(saved, tmp_path / "out"))
+
+
+@pytest.fixture(scope="module")
+def saved(result: wp.TrackResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return result.save(tmp_path_factory.mktemp("saved") / "out")
 
 
 def test_a_session_reads_back_to_the_bit(simulation: Simulation, tmp_path: Path) -> None:
@@ -47,9 +59,8 @@ def test_ready_orientations_are_written_too(simulation: Simulation, tmp_path: Pa
 
 
 def test_a_file_in_the_way_of_a_folder_and_the_other_way_round_leaves_all_as_it_was(
-    result: wp.TrackResult, tmp_path: Path
+    result: wp.TrackResult, out: Path
 ) -> None:
-    out = result.save(tmp_path / "out")
     (out / "mine").write_text("keep")
     (out / "summary.json").unlink()
     (out / "summary.json").mkdir()
@@ -79,10 +90,9 @@ def test_the_subjects_urdf_opens_in_other_tools_and_says_how_sure_it_is(
     assert fore[2] - upper[2] == pytest.approx(-person.lengths["left_upper_arm"], abs=1e-12)
 
 
-def test_what_is_no_result_is_named(result: wp.TrackResult, tmp_path: Path) -> None:
+def test_what_is_no_result_is_named(out: Path, tmp_path: Path) -> None:
     with pytest.raises(wp.MissingFile, match=r"no pose\.parquet in it"):
         wp.load_result(tmp_path)
-    out = result.save(tmp_path / "out")
     table = pl.read_parquet(out / "pose.parquet")
     for changed, says in (
         (table.drop("time"), "no column 'time'"),
