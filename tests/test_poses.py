@@ -29,7 +29,7 @@ SEED = 5301
 def perform(protocol: str) -> tuple[Person, Simulation]:
     person = simulate_person(SEED, 0.012)
     imperfections = replace(PEOPLE_PRESET, mount="any")
-    options = {"rate_hz": 50.0, "clasp_s": 50.0, "circles": 0}
+    options = {"rate_hz": 50.0, "clasp_s": 30.0, "circles": 0}
     return person, simulate(person.lengths, seed=SEED, imperfections=imperfections, protocol=protocol, **options)
 
 

@@ -210,7 +210,7 @@ def test_exit_code_and_file_carry_the_quality(
 def test_a_measured_length_that_is_right_to_a_centimetre_is_not_contradicted() -> None:
     """The estimate of the upper arm is off by as much on people, whatever its residuals say."""
     person = simulate_person(3)
-    recording = simulate(person.lengths, seed=3, circles=0, clasp_s=40.0, rate_hz=50.0).recording()
+    recording = simulate(person.lengths, seed=3, circles=0, clasp_s=30.0, rate_hz=50.0).recording()
     for error, contradicted in ((0.012, False), (0.060, True)):
         measured = {name: person.lengths[name] for name in ("shoulder_width", "right_upper_arm")}
         measured["left_upper_arm"] = person.lengths["left_upper_arm"] + error

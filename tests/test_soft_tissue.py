@@ -78,7 +78,9 @@ def test_elbows_that_fit_hinges_well_do_not_overrule_the_clasp() -> None:
     """Of a person with firm straps; elbows are no exact hinges however firm the straps are."""
     person = simulate_person(24000, 0.012)
     firm = replace(PEOPLE_PRESET, mount="any", tissue_gain=0.3, tissue_random=0.3, sway=0.3, clock_offset=0.0)
-    recording = simulate(person.lengths, seed=24000, imperfections=firm, circles=0, rate_hz=50.0).recording()
+    recording = simulate(
+        person.lengths, seed=24000, imperfections=firm, clasp_s=40.0, circles=0, rate_hz=50.0
+    ).recording()
     assert calibrate(recording, measured=person.measured, prior=person.prior).rms_gap < 0.045
 
 
@@ -87,7 +89,7 @@ def test_arms_show_how_exactly_a_person_stood() -> None:
     person, stds = simulate_person(24000, 0.012), []
     for size in (0.3, 1.0):
         sizes = replace(PEOPLE_PRESET, mount="any", start_pose=size)
-        options = {"imperfections": sizes, "clasp_s": 40.0, "circles": 0, "rate_hz": 50.0}
+        options = {"imperfections": sizes, "clasp_s": 25.0, "circles": 0, "rate_hz": 50.0}
         recording = simulate(person.lengths, seed=24000, **options).recording()
         stds.append(calibrate(recording, measured=person.measured).subject.start_pose_offset["torso"][2])
     assert stds[0] < 0.75 * stds[1]
