@@ -21,7 +21,7 @@ from wepose_pin.writers import write_session
 @pytest.fixture(scope="module")
 def made(person: Person) -> Simulation:
     """A minute: two stretches of joined hands, of which the session tells, and what lies between."""
-    return simulate(person.lengths, seed=8, clasp_s=30.0, circles=2)
+    return simulate(person.lengths, seed=8, clasp_s=20.0, circles=1)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_an_open_loop_in_chunks_is_the_whole(made: Simulation, subject: Subject)
 def test_a_summary_keeps_no_chunk_in_memory(made: Simulation) -> None:
     recording, passed = made.recording(), list[weakref.ref[np.ndarray]]()
     summary = TrackSummary(recording)
-    for tracked in summary.accumulate(track_chunks(Tracker(), recording, 10.0)):
+    for tracked in summary.accumulate(track_chunks(Tracker(), recording, 5.0)):
         passed.append(weakref.ref(tracked.pose.point_cov["right_palm"]))
     assert len(passed) > 4
     assert not any(values() is not None for values in passed[:-1])
