@@ -142,7 +142,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             (GYRO, (gyro_S,), of_gyro, STUCK_S),
             (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
-            first, last = np.array(find_runs(repeats), dtype=int).reshape(-1, 2).T - 1
+            first, last = np.array(find_runs(repeats) if repeats.any() else [], dtype=int).reshape(-1, 2).T - 1
             length = last - first + 1
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             if not long.any():
