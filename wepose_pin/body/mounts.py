@@ -192,7 +192,7 @@ def align_sensors(
     nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
     mounts: dict[str, Rotation] = {}
     heading_offsets: dict[str, float] = {}
-    repeats, facts = list[float](), dict[str, float | str]()
+    repeats = list[float]()
     # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     for segment, R_VS in R_VS_start.items():
@@ -205,7 +205,7 @@ def align_sensors(
         psi = compute_heading_offset(R_VS, R_WS_nominal)
         R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS
         error = R_WS_start * R_WS_nominal.inv()
-        tilt_error, limit = float(error.magnitude()), float(np.deg2rad(MOUNT_WARNING_DEG))
+        tilt_error = float(error.magnitude())
         if tilt_error > np.deg2rad(MAX_MOUNT_ERROR_DEG):
             name, remedy = ".mount", "state which sensor axis points up and which forward"
             if subject is not None and segment in subject.mounts and not recording.remounted:
@@ -216,8 +216,7 @@ def align_sensors(
                 f"start pose ({format_span(start)}); {remedy}, or the seconds of the start pose in [phases]"
             )
         mount_cov = find_mount_covariance(recording, segment, subject, start_pose)
-        if tilt_error > limit and mount_cov is None:
-            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit))
+        value, limit, facts = tilt_error, float(np.deg2rad(MOUNT_WARNING_DEG)), dict[str, float | str]()
         if mount_cov is not None and subject is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
@@ -231,13 +230,12 @@ def align_sensors(
                 repeat_std = np.array(start_pose.table.segments[segment].repeat_std[:2])
                 misfit_cov = np.diag(repeat_std**2)
                 repeats += (misfit / repeat_std).tolist()
-            stds, value = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5, float(np.linalg.norm(misfit))
+            stds, facts = float(misfit @ np.linalg.solve(misfit_cov, misfit)) ** 0.5, {"variant": "as-calibrated"}
             if stds > MOUNT_MOVED_STDS:
+                value = float(np.linalg.norm(misfit))
                 limit = value * MOUNT_MOVED_STDS / stds  # [rad] in the direction of the misfit
                 facts = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
-                diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
-            elif tilt_error > limit:
-                facts = {"variant": "as-calibrated"}
-                diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, tilt_error, limit, facts))
+        if value > limit:
+            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
         mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi
     return mounts, heading_offsets, diagnostics, estimate_repeat_share(repeats)
