@@ -33,6 +33,7 @@ STEADY_TURN_S = 20.0  # longest steady rotation of a person, as on an office cha
 LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks beyond white noise; a person sways more
 
 ACCEL_BIAS_STD = 0.003  # [rad] tilt error from the bias of a calibrated MEMS accelerometer (3 mg: our assumption)
+GRAVITY_RANGE = (3.0, 30.0)  # [m/s²] of a mean norm; another one is no gravity, or in another unit
 MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
 
 
@@ -78,14 +79,15 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     """Estimate noise and bias from static samples: `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²].
 
     `worn`: a person wears the sensor and sways. A phase of a second or two does not show sway, so its uncertainty is
-    added to that of the bias. `BadPhase`: fewer than 10 samples, or accel without gravity.
+    added to that of the bias. `BadPhase`: fewer than 10 samples, or accel without gravity in m/s².
     """
     n = len(gyro_S)
     if n < 10:
         raise BadPhase(f"the static phase holds {n} samples; at least 10 are needed to measure noise")
     gravity = float(np.sqrt(np.einsum("ni,ni->n", accel_S, accel_S)).mean())
-    if not gravity > 0.0:
-        raise BadPhase("the static phase holds no gravity: accel is zero; specific force is needed, +g up when static")
+    if not GRAVITY_RANGE[0] < gravity < GRAVITY_RANGE[1]:
+        needed = "specific force in m/s² is needed, 9.8 upwards when static"
+        raise BadPhase(f"accel_S is {gravity:.3g} in the static phase, which is no gravity; {needed}")
     size, accel = max(1, round(BLOCK_S * rate_hz)), accel_S / gravity
     blocks, gyro_cov = n // size, _compute_cov(gyro_S)
     # Means of blocks average white noise out and keep sway; less than four show none.
@@ -231,7 +233,7 @@ def find_reference_phases(
             try:
                 noises[segment] = estimate_noise(part.gyro_S, part.accel_S, recording.rate_hz, worn)
             except WeposeError as error:
-                raise type(error)(f"{where}: sensors.{segment}: {error}") from error
+                raise type(error)(f"{where}: sensors.{segment}.{error}") from error
             force_S = part.accel_S.mean(axis=0)
             up_S[segment] = force_S / np.linalg.norm(force_S)
     diagnostics += _check_common_rotation(f"{where}: {'phases.static' if lying else place}", static, noises, up_S)

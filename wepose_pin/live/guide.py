@@ -70,7 +70,7 @@ class GuideOptions:
 
     def calibrate(self, source: Recording | Path, entered: Mapping[str, float] = MappingProxyType({})) -> Calibration:
         """Calibrate a recording, with lengths [m] that the person has `entered`; that of a file is saved beside it."""
-        recording = source.check(units=False) if isinstance(source, Recording) else load_session(source)
+        recording = source.check() if isinstance(source, Recording) else load_session(source)
         measured, protocol = {**self.measured, **entered}, choose_parts(self.protocol, recording.phases)
         calibration = calibrate(
             recording,

@@ -190,7 +190,7 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
                     first = last - seconds + 1.0 / attempt.clock.rate_hz
                     try:
                         static = replace(attempt.make_recording(), phases={"static": ((first, last),)})
-                        check_units(static.check(units=False))
+                        check_units(static.check())
                     except BadData as error:
                         reason = str(error)
                         break

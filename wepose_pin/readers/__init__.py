@@ -279,7 +279,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         diagnostics += _report_bridged_gaps(segment, missing, long_gap, clock.step)
     rate_hz = clocks.measure_rate(time)
     recording = replace(head, time=time, rate_hz=rate_hz, sensors=sensors, diagnostics=tuple(diagnostics))
-    recording.check(units=False)
+    recording.check()
     return replace(recording, diagnostics=(*recording.diagnostics, *recording.check_signals()))
 
 

@@ -116,7 +116,7 @@ def read_live_log(path: Path) -> LiveRecording:
         ticks_of_resets = (int(event["tick"]) for event in events if event["kind"] == "reset")
         resets = tuple(tick for tick in ticks_of_resets if tick < synchronizer.next_tick)
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, resets)
-    recording = recording.check(units=False)
+    recording = recording.check()
     if not is_complete:
         recording = replace(recording, diagnostics=(Diagnostic("file-incomplete", WARNING, path.name),))
     first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0

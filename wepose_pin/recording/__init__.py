@@ -27,7 +27,6 @@ from .intervals import find_runs as find_runs
 from .intervals import format_span as format_span
 from .intervals import format_time as format_time
 from .intervals import select_interval as select_interval
-from .limits import MEDIAN_FORCE
 from .plausibility import check_signals
 from .sensors import AXES as AXES
 from .sensors import ImuSensor as ImuSensor
@@ -173,7 +172,7 @@ class Recording:
             else:
                 raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
             count = count or len(np.atleast_1d(values[0] if isinstance(values, tuple) else values))
-        recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check(units=False)
+        recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check()
         check_arrays(f"{name}: sensors.", rate_hz, {each: (s.gyro_S, s.accel_S) for each, s in recording.imus.items()})
         for each, imu in recording.imus.items():
             built[each] = replace(imu, gyro_range=find_gyro_range(imu.gyro_S, imu.accel_S))
@@ -185,12 +184,11 @@ class Recording:
                 f"{error.finding}; gyro_S in rad/s, accel_S in m/s² and the right rate_hz are needed"
             ) from None
 
-    def check(self, units: bool = True) -> Recording:
-        """Check a recording and return it; `units`: its unit of force too, by the median.
+    def check(self) -> Recording:
+        """Check a recording and return it.
 
         `BadOption`: a field has a wrong type. `BadData`: shapes differ, samples are too few, a number is not finite,
-        time does not increase or contradicts the rate, specific force is not in m/s². `BadPhase`: a phase is empty or
-        outside the recording.
+        time does not increase or contradicts the rate. `BadPhase`: a phase is empty or outside the recording.
         """
         where, time = self.where(), self.time
         check_fields(self, f"{where}: ")
@@ -227,11 +225,6 @@ class Recording:
             if sensor.gap is not None:
                 check_array(f"{place}.gap", sensor.gap, (count,), EACH_TIME, kind="flag")
         check_phases(where, time, self.phases)
-        for segment, imu in self.imus.items() if units else ():
-            force = float(np.median(np.linalg.norm(imu.accel_S, axis=1)))
-            if force and not MEDIAN_FORCE[0] < force < MEDIAN_FORCE[1]:
-                text = f"{where}: sensors.{segment}.accel_S is {force:.3g} in the median; m/s² is needed"
-                raise BadData(f"{text}, 9.8 where nothing moves")
         return self
 
     def check_signals(self) -> tuple[Diagnostic, ...]:

@@ -17,9 +17,6 @@ LARGEST_NUMBER = 1e30
 NARROWEST_GYRO_RANGE = 2.0  # [rad/s]
 NARROWEST_ACCEL_RANGE = 15.0  # [m/s²]
 
-# Plausible median specific force [m/s²] of a recording: free fall or 30 g do not last for half of it.
-MEDIAN_FORCE = (3.0, 300.0)
-
 # [s] between samples of a body-worn sensor: a longer step means that the times are in another unit; MEMS sensors give
 # at most 32 kHz (TDK ICM-42688).
 LONGEST_STEP_S, SHORTEST_STEP_S = 0.5, 1e-6

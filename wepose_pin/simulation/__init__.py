@@ -97,7 +97,7 @@ class Simulation:
             measured = bridge(gyro_S, lost, self.time), bridge(self.accel_S[segment], lost, self.time)
             sensors[segment] = ImuSensor(*measured, stated_quat_LS=stated)
         phases = {phase: tuple(spans) for phase, spans in self.phases.items() if spans}
-        return Recording(name, self.time, self.rate_hz, sensors, phases).check(units=False)
+        return Recording(name, self.time, self.rate_hz, sensors, phases).check()
 
     @property
     def girdles(self) -> dict[str, np.ndarray]:
