@@ -250,13 +250,10 @@ def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult
         assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
 
 
-def test_objects_show_themselves_in_a_notebook(simulated: Simulation, result: wp.TrackResult) -> None:
-    recording, torso = simulated.recording(), simulated.recording().sensors["torso"]
-    orientation = wp.estimate_orientation(torso.gyro_S, torso.accel_S, recording.rate_hz, static=(0.5, 4.5))
-    for each in (result, orientation):
-        page = each._repr_html_()
-        assert escape(repr(each)) in page
-        assert ElementTree.fromstring(f"<div>{page}</div>") is not None
+def test_a_result_shows_itself_in_a_notebook(result: wp.TrackResult) -> None:
+    page = result._repr_html_()
+    assert escape(repr(result)) in page
+    assert ElementTree.fromstring(f"<div>{page}</div>") is not None
 
 
 @pytest.mark.parametrize("name", ["anna", 'a"b\\c', "é α 漢", "line\nend\ttab", "\x00\x07\x7f\x80\u2028"])

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arguments import check_fields
 from ..compilation import fma, inlined
-from ..diagnostics import Diagnostic, notebook_html
+from ..diagnostics import Diagnostic
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from .phases import SensorNoise
 
@@ -70,9 +70,6 @@ class Orientation(NamedTuple):
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
         share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
         return f"Orientation({len(self.quat_VS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
-
-    def _repr_html_(self) -> str:
-        return notebook_html(self, self.diagnostics)
 
 
 def join_orientations(parts: Sequence[Orientation]) -> Orientation:
