@@ -82,12 +82,7 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     """Exact motion, no noise: headings drawn from the full circle come back without a guess."""
     person = simulate_person(3)
     simulation = simulate(
-        person.lengths,
-        seed=3,
-        noise=wp.NOISE_FREE,
-        imperfections=replace(wp.IDEAL_PRESET, mount="any"),
-        clasp_s=40.0,
-        circles=0,
+        person.lengths, seed=3, noise=wp.NOISE_FREE, imperfections=replace(wp.IDEAL_PRESET, mount="any"), circles=0
     )
     recording = simulation.recording()
     assert all(sensor.stated_quat_LS is None for sensor in recording.sensors.values())

@@ -78,9 +78,7 @@ def test_elbows_that_fit_hinges_well_do_not_overrule_the_clasp() -> None:
     """Of a person with firm straps; elbows are no exact hinges however firm the straps are."""
     person = simulate_person(24000, 0.012)
     firm = replace(PEOPLE_PRESET, mount="any", tissue_gain=0.3, tissue_random=0.3, sway=0.3, clock_offset=0.0)
-    recording = simulate(
-        person.lengths, seed=24000, imperfections=firm, clasp_s=40.0, circles=0, rate_hz=50.0
-    ).recording()
+    recording = simulate(person.lengths, seed=24000, imperfections=firm, circles=0, rate_hz=50.0).recording()
     assert calibrate(recording, measured=person.measured, prior=person.prior).rms_gap < 0.045
 
 
