@@ -23,7 +23,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sensors in any rotation; joined hands for thirty seconds."""
     world, folder = replace(MILD_PRESET, mount="any"), tmp_path_factory.mktemp("session")
     lengths = simulate_person(3).lengths
-    made = wp.simulate(lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0)
+    made = wp.simulate(lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0, rate_hz=50.0)
     write_session(folder, made.recording("anna <3"))
     return folder
 
