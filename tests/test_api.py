@@ -237,7 +237,7 @@ def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, 
     assert moved.recorded_time[[0, -1]] == pytest.approx([10.0, 16.0], abs=0.02)
     with pytest.raises(wp.WeposeError, match="a Robot has arms and margins of its own"):
         wp.retarget(result, moved.robot, speed_scale=0.9)
-    with pytest.raises(wp.WeposeError, match="--arm left: arm has no left arm"):
+    with pytest.raises(wp.WeposeError, match="`arm` left: arm has no left arm"):
         wp.retarget(result, urdf, arm="left")
 
 

@@ -305,7 +305,7 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "x.dat"], "-o x.dat: '.dat' is no format's suffix; state it by --format; there is: bvh, c3d, csv"),
+        (["-o", "x.dat"], "x.dat: '.dat' is no format's suffix; state it by --format; there is: bvh, c3d, csv"),
         (["-o", "x.trc", "--format", "tcr"], "--format tcr: not known; did you mean 'trc'?"),
         (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
         (["-o", "x.txt", "--format", "placement"], "name it x.sto"),
@@ -335,7 +335,7 @@ def test_wrong_options_take_one_line(
 
 def test_nothing_is_overwritten_without_force(result: Path, tmp_path: Path) -> None:
     (tmp_path / "x.trc").write_text("mine")
-    with pytest.raises(ExistingOutput, match="--force"):
+    with pytest.raises(ExistingOutput, match="`force=True` replaces"):
         export(result, tmp_path / "x.trc")
     assert (tmp_path / "x.trc").read_text() == "mine"
     export(result, tmp_path / "x.trc", force=True)

@@ -217,7 +217,7 @@ def test_what_is_wrong_in_the_scored_seconds_is_not_fitted_away(pose: Pose, tmp_
 def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
     time, quats, points = in_laboratory(pose)
     still = {name: np.tile(quat[:1], (len(time), 1)) for name, quat in quats.items()}
-    with pytest.raises(WeposeError, match=r"no offset of the clocks fits .* --time-offset"):
+    with pytest.raises(WeposeError, match=r"no offset of the clocks fits .* `time_offset`"):
         register(pose, Pose(time, still, {}))
     with pytest.raises(WeposeError, match="no segment in common, whose orientation is needed"):
         register(pose, Pose(time, {}, {"left_palm": points["left_palm"]}))
@@ -225,7 +225,7 @@ def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
         register(rows_of(pose, slice(0, 100)), Pose(time, quats, {}))
     tilted = Rotation.from_rotvec([0.7, 0.0, 0.7])
     leaning = {name: (tilted * Rotation.from_quat(q)).as_quat() for name, q in quats.items()}
-    with pytest.raises(WeposeError, match=r"no axis of the reference's world is up: .* --fit segments"):
+    with pytest.raises(WeposeError, match=r"no axis of the reference's world is up: .* `fit` segments"):
         register(pose, Pose(time, leaning, {}))
 
 

@@ -114,9 +114,9 @@ def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
-    with pytest.raises(errors.WeposeError, match="--robot pandas: not known; did you mean 'panda'"):
+    with pytest.raises(errors.WeposeError, match="`robot` pandas: not known; did you mean 'panda'"):
         retargeting.find_map("pandas")
-    with pytest.raises(errors.WeposeError, match=r"--arm left: arm has no left arm; there is: right"):
+    with pytest.raises(errors.WeposeError, match=r"`arm` left: arm has no left arm; there is: right"):
         retargeting.load_robot(retargeting.find_map(str(urdf)), ("left",))
     urdf.with_suffix(".toml").unlink()
     with pytest.raises(errors.WeposeError, match=r"no arm.toml beside it; a robot needs a map"):

@@ -47,18 +47,18 @@ def test_an_interval_or_a_phase_is_selected(interval, phase, selected, result: P
 @pytest.mark.parametrize(
     ("interval", "phase", "said"),
     [
-        ((3.0, 2.0), None, "--interval 3 2: two times in seconds are needed, the earlier one first"),
+        ((3.0, 2.0), None, "`interval` 3 2: two times in seconds are needed, the earlier one first"),
         ((2.0, 2.0), None, "the earlier one first"),
-        ((0.0, 3.0), None, "--interval 0 3: the recording runs from 2 to 5 s"),
-        ((3.0, 7.0), None, "--interval 3 7: the recording runs from 2 to 5 s"),
+        ((0.0, 3.0), None, "`interval` 0 3: the recording runs from 2 to 5 s"),
+        ((3.0, 7.0), None, "`interval` 3 7: the recording runs from 2 to 5 s"),
         ((2.501, 2.504), None, "the interval 2.501 to 2.504 s has no sample"),
-        ((2.0, 3.0), "start", "--interval 2 3: --phase start is given too"),
-        (None, "stat", "--phase stat: the recording has no such phase; did you mean 'start'"),
-        (None, "empty", "--phase empty: the recording has no such phase"),
-        (None, "reach", "--phase reach: reach has 2 intervals; choose reach:1 (2.5 to 3 s), reach:2 (3.5 to 4.2 s)"),
-        (None, "reach:3", "--phase reach:3: reach has 2 intervals"),
-        (None, "reach:0", "--phase reach:0: reach has 2 intervals"),
-        (None, "start:2", "--phase start:2: start has one interval; choose start:1"),
+        ((2.0, 3.0), "start", "`interval` 2 3: `phase` start is given too"),
+        (None, "stat", "`phase` stat: the recording has no such phase; did you mean 'start'"),
+        (None, "empty", "`phase` empty: the recording has no such phase"),
+        (None, "reach", "`phase` reach: reach has 2 intervals; choose reach:1 (2.5 to 3 s), reach:2 (3.5 to 4.2 s)"),
+        (None, "reach:3", "`phase` reach:3: reach has 2 intervals"),
+        (None, "reach:0", "`phase` reach:0: reach has 2 intervals"),
+        (None, "start:2", "`phase` start:2: start has one interval; choose start:1"),
     ],
 )
 def test_what_selects_nothing_is_said(interval, phase, said: str, result: Path, tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_what_selects_nothing_is_said(interval, phase, said: str, result: Path, 
 def test_a_recording_without_phases_has_none_to_choose(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "result", a_pose())
     (folder / "summary.json").write_text('{"recorded_phases": {}}', encoding="utf-8")
-    with pytest.raises(wp.WeposeError, match="has no phases; use --interval FROM TO"):
+    with pytest.raises(wp.WeposeError, match="has no phases; use `interval`"):
         wp.export(folder, tmp_path / "a.csv", phase="start")
 
 

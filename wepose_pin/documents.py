@@ -340,7 +340,7 @@ def _check_folder(out: Path, force: bool, prefix: str) -> None:
     if not existing.is_dir():
         raise ExistingOutput(f"{out}: cannot be made: {existing} is a file; a folder is needed for the output")
     if not force and out.is_dir() and any(not path.name.startswith(prefix) for path in out.iterdir()):
-        raise ExistingOutput(f"{out}: exists and is not empty; --force replaces its files, -o names another folder")
+        raise ExistingOutput(f"{out}: exists and is not empty; `force=True` replaces its files, or name another folder")
 
 
 @contextmanager
@@ -362,9 +362,9 @@ def whole_file(file: Path, force: bool = False) -> Iterator[Path]:
 def check_output(file: Path, force: bool = False) -> None:
     """Raise `ExistingOutput` where `file` exists and `force` is false, or it cannot be a file."""
     if file.is_dir() or not file.absolute().parent.is_dir():
-        raise ExistingOutput(f"{file}: not a file that can be written; -o names a file in an existing folder")
+        raise ExistingOutput(f"{file}: not a file that can be written; name a file in an existing folder")
     if file.exists() and not force:
-        raise ExistingOutput(f"{file}: exists; --force replaces it, -o names another file")
+        raise ExistingOutput(f"{file}: exists; `force=True` replaces it, or name another file")
 
 
 @contextmanager

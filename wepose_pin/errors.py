@@ -1,7 +1,7 @@
 """The errors a user can cause; every one is a `WeposeError` whose text is one line.
 
-The text names the file, the place in it, the value found and what would be right. The command line prints it and
-exits with 2; from Python it is an ordinary exception.
+The text names the file, the place in it, the value found and what would be right, and has arguments in backticks. The
+command line prints it with its options in place of arguments and exits with 2; from Python it is an ordinary exception.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class MissingFile(WeposeError):
 
 
 class ExistingOutput(WeposeError):
-    """The output exists already and `--force` was not given."""
+    """The output exists already and `force` was not given."""
 
 
 class BadSession(WeposeError):
@@ -91,10 +91,10 @@ class BadOption(WeposeError, ValueError):
 
 
 class WrongOption(BadOption):
-    """An option of a command whose value is not possible; its name is without ``--``."""
+    """An argument whose value is not possible, by its name in Python."""
 
     def __init__(self, name: str, value: object, needed: str) -> None:
-        super().__init__(f"--{name} {value}: {needed}")
+        super().__init__(f"`{name}` {value}: {needed}")
         self.name, self.value, self.needed = name, value, needed
 
 

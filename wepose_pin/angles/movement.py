@@ -91,7 +91,7 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
     """
     step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 1.0
     if not 0.0 < cutoff_hz < 0.45 / step:
-        raise WrongOption("low-pass-hz", f"{cutoff_hz:g}", f"above 0 and below {0.45 / step:.3g} Hz is needed here")
+        raise WrongOption("low_pass_hz", f"{cutoff_hz:g}", f"above 0 and below {0.45 / step:.3g} Hz is needed here")
     quat_WL = {segment: quat.copy() for segment, quat in pose.quat_WL.items()}
     for quat in quat_WL.values():
         for a, b in find_runs(np.isfinite(quat).all(axis=1)):

@@ -156,7 +156,7 @@ class Subject:
         if self.quality == "fail":
             raise BadSubject(
                 f"subject '{self.name}': its calibration failed (quality = \"fail\"); calibrate again, or use it "
-                f"with --accept-failed (in Python accept_failed=True)"
+                f"with `accept_failed=True`"
             )
 
     def check_body(self, table: BodyTable) -> None:

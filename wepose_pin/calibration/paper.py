@@ -114,7 +114,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
     if start_pose != NEUTRAL_POSE:
         raise BadOption(
             f"formulation 'paper' takes orientations from the N-pose on, and the recording has start_pose = "
-            f"'{start_pose}'; record a start in {NEUTRAL_POSE}, or use --formulation full"
+            f"'{start_pose}'; record a start in {NEUTRAL_POSE}, or use `formulation` full"
         )
     if not all(isinstance(c, Closure) and c.kind == "coincide" for c in protocol.conditions):
         raise BadOption(
@@ -127,7 +127,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
     if not any(set(group) <= set(problem.measured) for group in groups):
         single = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
-            f"formulation 'paper' needs one measured length that fixes the scale, as in --measured "
+            f"formulation 'paper' needs one measured length that fixes the scale, as in `measured` "
             f"{protocol.measured_example}; {one_of(single)}"
         )
 

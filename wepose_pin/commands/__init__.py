@@ -14,6 +14,7 @@ import gc
 import io
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -55,7 +56,7 @@ def main(argv: list[str] | None = None) -> None:
         if _stopped or isinstance(error, KeyboardInterrupt):
             code, line = 130, "stopped"
         elif isinstance(error, WeposeError):
-            code, line = 2, str(error)
+            code, line = 2, re.sub(r"`(\w+)(=True)?`", lambda name: f"--{name[1].replace('_', '-')}", str(error))
         elif isinstance(error, OSError):
             code, line = 2, f"{error.filename or 'output'}: {error.strerror or error}"
         else:

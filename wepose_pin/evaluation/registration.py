@@ -62,13 +62,13 @@ def register(
     if not segments:
         raise BadData(
             "pose and reference have no segment in common, whose orientation is needed to align them; give markers a "
-            "[segments] table (--markers), or take --fit none where the reference is on our clock and in our world"
+            "[segments] table (`markers`), or take `fit` none where the reference is on our clock and in our world"
         )
     pose = replace(pose, quat_WL={segment: pose.quat_WL[segment] for segment in segments})
     common = replace(truth, quat_WL={segment: truth.quat_WL[segment] for segment in segments})
     begin, end = float(pose.time[0]), float(pose.time[-1])
     fit_end, correlation = begin + FITTED * (end - begin), float("nan")
-    needed = f"a third of them aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --fit none"
+    needed = f"a third of them aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or `fit` none"
     if fit_end - begin < SHORTEST_S:
         raise BadData(f"the pose lasts {end - begin:.1f} s; {needed}")
     if offset_s is None:
@@ -121,7 +121,7 @@ def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[
     if score[best] < LEAST_CORRELATION:
         raise BadData(
             f"no offset of the clocks fits in the first {fitted[1] - fitted[0]:.0f} s of the pose: speeds correlate by "
-            f"{score[best]:.2f} at best; state it as --time-offset, or is it another recording?"
+            f"{score[best]:.2f} at best; state it as `time_offset`, or is it another recording?"
         )
     lag = (best - (ours.shape[1] - 1)) * STEP_S  # of ours in theirs
     coarse = fitted[0] - (float(truth.time[0]) + lag)
@@ -188,7 +188,7 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
         if full[2] @ AXES[up] < UPRIGHT:
             raise BadData(
                 f"no axis of the reference's world is up: {up} is nearest; where its segments' frames are not ours, "
-                "--fit segments fits them too"
+                "`fit` segments fits them too"
             )
     axis_V = np.asarray(AXES[up])
     across = np.cross(axis_V, AXES["+z"])

@@ -328,7 +328,7 @@ def read_robot(name: str) -> tuple[CommandStream, str]:
         chosen = load_robot(find_map(str(neighbour) if neighbour.is_file() else robot), sides, **margins)
         return CommandStream(chosen, **timing), str(values.get("to", ROBOT_PORT))
     except WrongOption as error:
-        raise BadOption(f"{name}: {error.name.replace('-', '_')} = {error.value}: {error.needed}") from None
+        raise BadOption(f"{name}: {error.name} = {error.value}: {error.needed}") from None
 
 
 def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:

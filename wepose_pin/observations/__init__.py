@@ -152,7 +152,7 @@ class PointPath:
                     places = " and ".join(point for point, _ in points)
                     raise BadSession(
                         f"{where}sensors.{link} is missing: without it the place of {places} is not known; add it, or "
-                        f"use a protocol without that point, or another body (--model)"
+                        f"use a protocol without that point, or another body (`model`)"
                     )
                 (B, c), R = sums.get(carrier, zero), start.rotation(link)
                 sums[carrier] = B + R @ vector[0], c + R @ vector[1]

@@ -390,7 +390,7 @@ def _bridge_gaps(
             lost_s, row = (last - first) * clock.step, clock.row[:first].max(initial=-1) + 1
             raise BadData(
                 f"{place}{signal}: samples are missing for {lost_s:.3f} s from {clock.time[first]:.3f} s, after row "
-                f"{row}; up to 50 ms are bridged; cut the recording there, or accept gaps by --gaps (gaps=True)"
+                f"{row}; up to 50 ms are bridged; cut the recording there, or accept gaps by `gaps=True`"
             )
     long_gap = clocks.find_long_gaps(lost, clock.step)
     signals = {signal: clocks.bridge(values, lost, clock.time) for signal, values in signals.items()}

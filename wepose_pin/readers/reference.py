@@ -114,7 +114,7 @@ def _read_rotations(path: Path, file: Any, table: MarkerTable) -> Reference:
             quats[segment] = _quat_from_matrices(transforms[:, labels.index(label), :3, :3])
     if not quats:
         listed = ", ".join(labels[:8]) or "without labels"
-        raise BadData(f"{path}: its rotations are of no known segment ({listed}); name them under --markers")
+        raise BadData(f"{path}: its rotations are of no known segment ({listed}); name them under `markers`")
     return Reference(np.arange(len(transforms)) / rate_hz, quats, {}, own_frames=True)
 
 
@@ -205,7 +205,7 @@ def _locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tab
     if not points and not quats:
         expected = sorted({each for ways in table.points.values() for way in ways for each in way} - set(table.points))
         listed = ", ".join(list(markers)[:8]) or "none"
-        raise BadData(f"{path}: no joint follows from its markers ({listed}, …); {one_of(expected)}, or by --markers")
+        raise BadData(f"{path}: no joint follows from its markers ({listed}, …); {one_of(expected)}, or by `markers`")
     return Reference(time, quats, points)
 
 

@@ -275,7 +275,7 @@ class Recording:
         """Return the intervals of a phase; `BadPhase`: the recording does not have it."""
         intervals = self.phases.get(name, ())
         if not intervals:
-            add, free = "add", "; without joined hands: --protocol free" if name == "clasp" else ""
+            add, free = "add", "; without joined hands: `protocol` free" if name == "clasp" else ""
             if (source := Path(self.where())).suffix == ".mcap":
                 add = f"write a session by `wepose info {source.name} --write` and add"
             raise BadPhase(

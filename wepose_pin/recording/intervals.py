@@ -69,7 +69,7 @@ def select_interval(
     interval: tuple[float, float] | None,
     phase: str | None,
 ) -> tuple[float, float] | None:
-    """Return the interval [s] that --interval or --phase selects; None: neither is given.
+    """Return the interval [s] that `interval` or `phase` selects; None: neither is given.
 
     It may exceed `time` (n,) [s] by `MOST_BEYOND` samples at each end. Of a phase with several intervals ``NAME:2`` is
     the second. `WrongOption`: both are given; the interval is empty or outside the recording; no such phase or number.
@@ -78,7 +78,7 @@ def select_interval(
         check_order(interval)
         shown = f"{format_time(interval[0])} {format_time(interval[1])}"
         if phase is not None:
-            raise WrongOption("interval", shown, f"--phase {phase} is given too; only one of them can select the time")
+            raise WrongOption("interval", shown, f"`phase` {phase} is given too; only one of them can select the time")
         if _is_beyond(time, *interval):
             raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
     if phase is None:
@@ -89,7 +89,7 @@ def select_interval(
     intervals = phases.get(name, ())
     if not intervals:
         known = [each for each in phases if phases[each]]
-        choices = one_of(known, name) if known else "the recording has no phases; use --interval FROM TO"
+        choices = one_of(known, name) if known else "the recording has no phases; use `interval`"
         raise WrongOption("phase", phase, f"the recording has no such phase; {choices}")
     if number > len(intervals) or (number == 0 and (len(intervals) > 1 or name != phase)):
         spans = ", ".join(f"{name}:{k} ({format_span(span)})" for k, span in enumerate(intervals[:5], 1))

@@ -129,12 +129,12 @@ def find_map(robot: str) -> RobotMap:
     if path.suffix.lower() in (".urdf", ".xml"):
         file = path.with_suffix(".toml")
         if not path.is_file():
-            raise MissingFile(f"--robot {robot}: no such file")
+            raise MissingFile(f"`robot` {robot}: no such file")
         if not file.is_file():
-            raise MissingFile(f"--robot {robot}: no {file.name} beside it; a robot needs a map (docs/robot-maps.md)")
+            raise MissingFile(f"`robot` {robot}: no {file.name} beside it; a robot needs a map (docs/robot-maps.md)")
         return read_map(file, urdf=path)
     if robot not in ROBOTS:
-        raise BadModel(f"--robot {robot}: not known; {one_of(ROBOTS, robot)}; or a file, FILE.urdf")
+        raise BadModel(f"`robot` {robot}: not known; {one_of(ROBOTS, robot)}; or a file, FILE.urdf")
     return read_map(asset("urdf", f"robots/{robot}.toml"))
 
 

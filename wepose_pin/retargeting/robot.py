@@ -87,9 +87,9 @@ def load_robot(
         arm that the robot does not have.
     """
     if not 0.0 < speed_scale <= 1.0:
-        raise WrongOption("speed-scale", f"{speed_scale:g}", "above 0, up to 1, the robot's full limits")
+        raise WrongOption("speed_scale", f"{speed_scale:g}", "above 0, up to 1, the robot's full limits")
     if not 0.0 <= limit_margin < np.pi:
-        raise WrongOption("limit-margin", f"{limit_margin:g}", "radians, at least 0, are needed")
+        raise WrongOption("limit_margin", f"{limit_margin:g}", "radians, at least 0, are needed")
     for side in sides or ():
         if side not in robot.arms:
             raise WrongOption("arm", side, f"{robot.name} has no {side} arm; {one_of(robot.arms)}")
@@ -150,7 +150,7 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
                 copies = f"copies '{mimics[name]}'" if name in mimics else "is copied by another joint"
                 state = copies if name in chain else f"does not move the hand's link '{arm.hand.link}'"
                 text = f"'{name}' is no joint of the arm: it {state}"
-                raise BadModel(f"{robot.where}: {where}: {text}; leave it out, it stays where `rest` has it")
+                raise BadModel(f"{robot.where}: {where}: {text}; leave it out, it stays where 'rest' has it")
             _check_limits(robot, name, limits[name])
     for name in robot.rest:
         robot.check_name("rest", "moving joint", name, limits)
@@ -195,7 +195,7 @@ def _narrow_range(name: str, limit: JointLimit, limit_margin: float) -> tuple[fl
     lower, upper = limit.lower + margin, limit.upper - margin
     if upper - lower < 2.0 * REST_MARGIN:
         text = f"joint '{name}' moves from {limit.lower:g} to {limit.upper:g} only"
-        raise WrongOption("limit-margin", f"{limit_margin:g}", text)
+        raise WrongOption("limit_margin", f"{limit_margin:g}", text)
     return lower, upper
 
 

@@ -230,10 +230,10 @@ class CommandStream:
         self, robot: Robot, rate_hz: float = 100.0, hold_after: float = HOLD_AFTER_S, stop_after: float = STOP_AFTER_S
     ) -> None:
         if not 10.0 <= rate_hz <= 1000.0:
-            raise WrongOption("rate-hz", f"{rate_hz:g}", "from 10 to 1000 commands a second")
+            raise WrongOption("rate_hz", f"{rate_hz:g}", "from 10 to 1000 commands a second")
         if not 0.0 < hold_after < stop_after < np.inf:
             needed = f"seconds, above 0 and less than stop_after = {stop_after:g}"
-            raise WrongOption("hold-after", f"{hold_after:g}", needed)
+            raise WrongOption("hold_after", f"{hold_after:g}", needed)
         self.robot, self.dt, self.hold_after, self.stop_after = robot, 1.0 / rate_hz, hold_after, stop_after
         self._omega = 2.0 * np.pi * SMOOTHING_HZ
         self.collision = CollisionModel(robot)

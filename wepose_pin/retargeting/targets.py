@@ -121,7 +121,7 @@ def find_person_arm(table: BodyTable, side: str) -> Limb:
             return limb
     raise BadData(
         f"the person's body has no {side} arm of {LINKS} segments from shoulder to palm with a counterpart on the "
-        f"other side; track with --model upper_body, which works even if sensors are missing"
+        f"other side; track with `model` upper_body, which works even if sensors are missing"
     )
 
 
@@ -171,7 +171,7 @@ def compute_arm_targets(
     if scale is not None and not 0.0 < scale < np.inf:
         raise WrongOption("scale", f"{scale:g}", "a number above 0 is needed")
     if not 0.0 <= smoothing_hz < np.inf:
-        raise WrongOption("smoothing-hz", f"{smoothing_hz:g}", "0, which does not smooth, or more is needed")
+        raise WrongOption("smoothing_hz", f"{smoothing_hz:g}", "0, which does not smooth, or more is needed")
     time = np.asarray(pose.time, dtype=float)
     if len(time) < 10:
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")

@@ -189,7 +189,7 @@ def retarget(
         robot = load_robot(find_map(str(robot)), list_sides(arm), **margins)
     elif arm is not None or margins:
         raise BadOption(
-            "arm, speed_scale, limit_margin: a Robot has arms and margins of its own; give `load_robot` them"
+            "arm, speed_scale, limit_margin: a Robot has arms and margins of its own; give `wp.load_robot` them"
         )
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))

@@ -183,11 +183,11 @@ def export(
         if option not in kind.options:
             having = " and ".join(each for each, other in formats.items() if option in other.options)
             reason = "there is no motion in it" if option in MOTION else f"only of format {having}"
-            raise BadOption(f"--{option.replace('_', '-')} {value}: not of format {name}; {reason}")
+            raise BadOption(f"`{option}` {value}: not of format {name}; {reason}")
     if rate_hz is not None:
         check_rate(rate_hz)
     if len(results) != 1 and kind.of != ROBOTS:
-        raise BadOption(f"--format {name}: a file of {len(results)} results; only lerobot takes several, as episodes")
+        raise BadOption(f"`format` {name}: a file of {len(results)} results; only lerobot takes several, as episodes")
     own = {option: value for option, value in own.items() if option not in MOTION}
     with contextlib.ExitStack() as files:
         whole = whole_folder(file, force, kind.earlier) if kind.earlier else whole_file(file, force)
@@ -214,12 +214,12 @@ def _read_motion(
     if _is_of_robot(result):
         if of == PERSON:
             others = ", ".join(each for each, other in list_formats().items() if other.of != PERSON)
-            raise BadOption(f"--format {format}: {result} is a robot's trajectory, for {others}")
+            raise BadOption(f"`format` {format}: {result} is a robot's trajectory, for {others}")
         robot = result.joint_motion() if isinstance(result, HasJointMotion) else read_joint_motion(Path(str(result)))
         robot = robot.select(interval, phase)
         return robot if rate_hz is None else robot.resample(rate_hz)
     if of == ROBOTS:
-        raise BadOption(f"--format {format}: is of robots, as `wepose retarget` writes them; {result} is none")
+        raise BadOption(f"`format` {format}: is of robots, as `wepose retarget` writes them; {result} is none")
     motion = result if isinstance(result, TrackResult) else load_result(Path(str(result)))
     motion = replace(motion, pose=select_pose(motion, interval, phase))
     if len(motion.time) < 2:
@@ -231,13 +231,13 @@ def _read_motion(
 def _choose_format(file: Path, name: str | None) -> str:
     formats, suffix = list_formats(), file.suffix.lower()
     if name is None and suffix.removeprefix(".") not in formats:
-        raise BadOption(f"-o {file}: '{suffix}' is no format's suffix; state it by --format; {one_of(formats)}")
+        raise BadOption(f"{file}: '{suffix}' is no format's suffix; state it by `format`; {one_of(formats)}")
     name = name or suffix.removeprefix(".")
     if name not in formats:
-        raise BadOption(f"--format {name}: not known; {one_of(formats, name)}")
+        raise BadOption(f"`format` {name}: not known; {one_of(formats, name)}")
     needed = f".{name}" if formats[name].suffix is None else formats[name].suffix
     if not needed and suffix.removeprefix(".") in (*formats, "bag", "db3"):  # readers would take it for a file
-        raise BadOption(f"-o {file}: format {name} is a folder; name it {file.stem}")
+        raise BadOption(f"{file}: format {name} is a folder; name it {file.stem}")
     if needed and suffix != needed:
-        raise BadOption(f"-o {file}: format {name} is for programs that go by the suffix: name it {file.stem}{needed}")
+        raise BadOption(f"{file}: format {name} is for programs that go by the suffix: name it {file.stem}{needed}")
     return name

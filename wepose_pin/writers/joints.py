@@ -56,7 +56,7 @@ def write_mcap(path: Path, motion: JointMotion) -> None:
 
 def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
     """Write a bag with the topics of `TYPES`; a stamp is the motion's time [s], and that of 0, none in ROS, is 1 ns."""
-    qos = import_library("rosbags.interfaces", "--format rosbag, mcap", "a ROS bag")
+    qos = import_library("rosbags.interfaces", "`format` rosbag, mcap", "a ROS bag")
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -118,7 +118,7 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     try:
         import rerun as rr
     except ImportError:
-        raise BadOption("--format rrd: needs rerun: pip install rerun-sdk") from None
+        raise BadOption("`format` rrd: needs rerun: pip install rerun-sdk") from None
     recording = rr.RecordingStream("wepose", recording_id=f"{motion.name} {motion.time[0]:g}", send_properties=False)
     recording.save(path)
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -262,12 +262,12 @@ def _check_alike(motions: Sequence[JointMotion]) -> int:
     descriptions = [f"robot {each.name}, {each.rate_hz:g} Hz, joints {', '.join(each.joints)}" for each in motions]
     for other, description in zip(others, descriptions[1:], strict=True):
         if description != descriptions[0]:
-            reason = f"and {first.where} is of {descriptions[0]}; --rate-hz makes one rate of all"
+            reason = f"and {first.where} is of {descriptions[0]}; `rate_hz` makes one rate of all"
             raise BadData(f"{other.where}: {description}; a data set has one robot and one rate, {reason}")
     rate_hz = round(first.rate_hz)
     if not is_even(first.time) or abs(rate_hz - first.rate_hz) > 1e-3:
         stated = f"{first.where}: {first.rate_hz:g} samples a second, or times that are uneven"
-        raise BadData(f"{stated}; a data set has a whole number of them, which --rate-hz makes")
+        raise BadData(f"{stated}; a data set has a whole number of them, which `rate_hz` makes")
     return rate_hz
 
 
@@ -288,7 +288,7 @@ def _compute_stats(table: pl.DataFrame) -> dict[str, dict[str, list[Any]]]:
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write the tasks as pandas writes a table whose index is their text; pyarrow stores what pandas says of it."""
-    pyarrow = import_library("pyarrow", "--format lerobot", "a data set")
+    pyarrow = import_library("pyarrow", "`format` lerobot", "a data set")
     from pyarrow import parquet
 
     index, keys = "__index_level_0__", ("name", "field_name", "pandas_type", "numpy_type", "metadata")

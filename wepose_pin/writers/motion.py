@@ -50,7 +50,7 @@ def is_even(time: np.ndarray) -> bool:
 def check_rate(rate_hz: float) -> None:
     """Raise `WrongOption` where no recording has that rate."""
     if not 1.0 <= rate_hz <= 10000.0:
-        raise WrongOption("rate-hz", f"{rate_hz:g}", "between 1 and 10000 samples a second")
+        raise WrongOption("rate_hz", f"{rate_hz:g}", "between 1 and 10000 samples a second")
 
 
 def resample_evenly(motion: TrackResult) -> TrackResult:

@@ -151,13 +151,13 @@ MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in sile
 
 def write_c3d(path: Path, motion: TrackResult) -> None:
     """Write points in W (z up, x forward) and segments to W, single precision; NaN in a gap, with a residual of −1."""
-    ezc3d = import_library("ezc3d", "--format c3d", "a C3D")
+    ezc3d = import_library("ezc3d", "`format` c3d", "a C3D")
     motion = resample_evenly(motion)
     points = find_measured_points(motion)
     n = len(motion.pose.time)
     if n > MOST_FRAMES:
         rate_hz = np.floor(motion.rate_hz * MOST_FRAMES / n)
-        raise BadData(f"{motion.where}: {n} samples; a .c3d holds {MOST_FRAMES}: --rate-hz {rate_hz:g}, or a .trc")
+        raise BadData(f"{motion.where}: {n} samples; a .c3d holds {MOST_FRAMES}: `rate_hz` {rate_hz:g}, or a .trc")
     p_W = np.stack([p.T for p in points.values()], axis=1)  # (3, points, n)
     file = ezc3d.c3d()
     texts = [f"{point.replace('_', ' ')} of {motion.name}"[:127] for point in points]
