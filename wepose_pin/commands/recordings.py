@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ..diagnostics import from_json, lines
-from ..errors import BadOption, WrongOption
+from ..errors import BadOption, WrongOption, one_of
 from . import options as opt
 from .options import described_by
 from .output import Outcome, print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
@@ -52,7 +52,7 @@ def info(
     with progress_bar() as progress:
         progress("reading", 0.0)
         body = None if model is None else load_model(model).table
-        file = find_file(file, body)
+        file, beside = find_file(file, body)
         session = out or file.absolute().parent / "session.toml"
         writes = write or out is not None
         description = describe_file(file, session.absolute().parent, body, None if model is None else Path(model))
@@ -64,6 +64,9 @@ def info(
     say(f"{file}: {description.title}")
     for fact in description.facts:
         say(f"  {fact}")
+    used = {file.name, *(Path(keys["file"]).name for keys in description.sensors.values() if "file" in keys)}
+    if unused := [each.name for each in beside if each.name not in used]:
+        say(f"  also in the folder, not used: {one_of(unused).removeprefix('there is: ')}")
     print_diagnostics(description.diagnostics)
     if description.recording is not None:
         header = ("sensor", "in the file", "holds", "peak rate", "median specific force", "gaps over 50 ms")

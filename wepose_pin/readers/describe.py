@@ -82,22 +82,22 @@ class Description:
             yield "?" if unknown else segment, label, holds, f"{fastest:.0f} deg/s", gravity, gaps
 
 
-def find_file(path: Path, body: BodyTable | None = None) -> Path:
-    """Find what is described of a path: the session or subject in a folder, or the first recording in it.
+def find_file(path: Path, body: BodyTable | None = None) -> tuple[Path, list[Path]]:
+    """Find what is described of a path: the session or subject in a folder, or the first recording of those in it.
 
     A file, a result, and a folder that is one recording are returned as they are.
     """
     if not path.is_dir() or (path / "pose.parquet").is_file():
-        return path
+        return path, []
     named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
     if named is not None or detect_format(path) is not None:
-        return named or (path if path.name else path.absolute())  # beside "." nothing is found
+        return named or (path if path.name else path.absolute()), []  # beside "." nothing is found
     files = [file for file in sorted(path.iterdir()) if file.is_file()]
     data = [file for file in files if file.suffix.lower() in TABLES or is_array_file(file) or detect_format(file)]
     if not data:
         raise MissingFile(f"{path}: a folder without session.toml, and without a recording in it; name a file")
     body = body or load_table()
-    return next((file for file in data if body.guess_segment(file.stem)), data[0])
+    return next((file for file in data if body.guess_segment(file.stem)), data[0]), data
 
 
 def describe_file(
@@ -315,16 +315,14 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
         about.sensors[segment] = {name: own if len(own) > 1 else own[0] for name, own in signals.items()}
         if content and "orientation" in signals:
             about.checks["orientation"] = "x, y, z, w? if w comes first, name its columns [1], [2], [3], [0]"
-    # A table with one sensor, whose segment is that of the file's name, has others beside it with the same columns.
-    own = body.guess_segment(path.stem) if content is None and len(guess.sensors) == 1 else None
+    # A table with one sensor, whose columns name no segment, has others beside it with the same columns.
     name, keys = next(iter(about.sensors.items()))
-    if own and name.startswith("?"):
-        files = {own: path}
-        for file in _list_files_like(path):
-            other = body.guess_segment(file.stem)
+    if content is None and len(guess.sensors) == 1 and name.startswith("?"):
+        files: dict[str, Path] = {}
+        for file in (path, *_list_files_like(path)):
             with contextlib.suppress(WeposeError):
-                if other and other not in files and read_names(file)[0] == names:
-                    files[other] = file
+                if file == path or read_names(file)[0] == names:
+                    files.setdefault(body.guess_segment(file.stem) or f"?{file.name}", file)
         about.sensors = {segment: {"file": _relative(file, folder), **keys} for segment, file in files.items()}
         about.title += f", {len(files)} files" if len(files) > 1 else ""
     else:
