@@ -119,7 +119,7 @@ def collect_nominal_mounts(
             others += " (remounted = true: the subject's are of another mounting)"
         # Calibrations close chains of lengths: they find no mount of a segment on which no length lies.
         can_calibrate = {length.segment for length in start_pose.table.lengths.values()} & set(missing)
-        remedy = "; or find it by `wepose calibrate` (without joined hands `protocol` free), then track with its `subject`"
+        remedy = "; or find it by `wepose calibrate` (without a clasp `protocol` free), then track with its `subject`"
         raise BadSession(
             f"{recording.where()}: sensors.{missing[0]}.mount is not known{others}: state it, as in "
             f'mount = {{ up = "+x", forward = "-z" }}{remedy if can_calibrate else ""}'

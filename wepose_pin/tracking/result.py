@@ -87,7 +87,7 @@ class TrackResult:
     def segments(self) -> SegmentOrientations:
         """The recording with its intermediate results; raises `BadData` where the result does not come from `track`."""
         if not isinstance(self.source, SegmentOrientations):
-            raise BadData(f"{self.name}: only a result of `wp.track` has its recording, and not one that was read or made")
+            raise BadData(f"{self.name}: only a result of `wp.track` has its recording, not one that was read or made")
         return self.source
 
     @property
