@@ -111,6 +111,7 @@ def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
     recording = pose.recording
     assert recording.rate_hz == pytest.approx(60.0)
     assert all(sensor.aligned for sensor in recording.sensors.values())
+    assert "start-pose-guessed" not in {each.code for each in pose.diagnostics}
     start = recording.span(pose.segments.start)
     forward = Rotation.from_quat(pose.quat_WL["torso"][start]).mean().apply([1.0, 0.0, 0.0])
     assert abs(np.arctan2(forward[1], forward[0])) < 0.01

@@ -215,7 +215,8 @@ def find_reference_phases(
     start, place = stated[0] if stated else find_static_window(recording), "phases.start"
     _check_samples(recording, start, "start")
     if not stated or recording.start_is_guessed:
-        diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
+        if not all(sensor.aligned for sensor in recording.sensors.values()):
+            diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
         place = "the guessed start pose"
     else:
         start = _find_static_part(recording, start, "start", diagnostics)
