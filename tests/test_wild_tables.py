@@ -102,13 +102,20 @@ def test_a_table_of_a_spreadsheet_may_be_a_text(name: str, capsys: pytest.Captur
     np.testing.assert_allclose(recording.sensors["torso"].gyro_S, GYRO, atol=0.006)
 
 
-def test_a_column_of_dates_is_named_where_the_rate_is_to_be_checked(
+def test_dates_are_read_and_what_holds_no_times_or_several_sensors_is_said(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     names = ",".join(["timestamp", *(f"torso_{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])
-    time = [f"2026-03-12 08:00:{0.01 * k:09.6f}" for k in range(N)]
-    (tmp_path / "a.csv").write_text(names + "\n" + lines(time, values(0), ","))
-    assert "rate_hz = 100.0   # CHECK: 'timestamp' does not hold numbers" in info(capsys, tmp_path / "a.csv")
+    time, path = [f"08:00:{0.02 * k:09.6f}" for k in range(N)], tmp_path / "a.csv"
+    path.write_text(names + "\n" + lines([f"2026-03-12 {each}" for each in time], values(0), ","))
+    assert f"{N} samples at 50 Hz, 1773302400 to" in info(capsys, path)
+    path.write_text(names + "\n" + lines(time, values(0), ","))
+    assert "100 Hz is a guess, as 'timestamp' holds no times" in info(capsys, path)
+    path.write_text(lines(time, values(0), ",").split("08:00:")[-1])
+    assert "the first line holds numbers; write the names" in info(capsys, path, code=2)
+    rows = [f"{k // 2},{'ab'[k % 2]}" for k in range(N)]
+    path.write_text(names.replace("stamp", "_ms,who") + "\n" + lines(rows, values(0), ","))
+    assert "rows of several sensors, told apart by 'who'" in info(capsys, path, code=2)
 
 
 def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -162,6 +162,17 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
     return np.ascontiguousarray(pl.DataFrame(columns).to_numpy().reshape(table.height, len(names)))
 
 
+def read_times(table: pl.DataFrame, name: str, file: str, place: str) -> np.ndarray:
+    """Read a column of times (n,) as `read_columns` does; of dates, also as texts: seconds since 1970."""
+    with contextlib.suppress(pl.exceptions.PolarsError):
+        times = table[name]
+        if times.dtype == pl.String:
+            times = times.str.strip_chars().str.to_datetime(time_unit="us", time_zone="UTC")
+        if times.dtype == pl.Datetime:
+            table = table.with_columns(1e-6 * times.dt.epoch("us"))
+    return read_columns(table, [name], file, place)[:, 0]
+
+
 def _is_parquet(path: Path) -> bool:
     """Return whether a file is Parquet, else it is a CSV; raise `MissingFile` where it is no table."""
     if path.is_dir():

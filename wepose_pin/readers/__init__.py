@@ -16,7 +16,7 @@ import polars as pl
 
 from ..arguments import check_arguments
 from ..body.table import NEUTRAL_POSE
-from ..data_tables import read_columns, read_table
+from ..data_tables import read_columns, read_table, read_times
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import Finite, Key, TomlTable, format_value, is_number, read_record, read_toml, toml_key
 from ..errors import BadData, BadSession, MissingFile, one_of, printable
@@ -352,7 +352,7 @@ def _read_columns(keys: SensorKeys, contents: dict[Any, Any]) -> tuple[Clock, Ma
     if keys.rate_hz is not None:
         time, source = np.arange(content.height) / keys.rate_hz, keys.at("rate_hz")
     else:
-        time, source = read_columns(content, [keys.time], str(path), keys.at("time"))[:, 0], str(path)
+        time, source = read_times(content, keys.time, str(path), keys.at("time")), str(path)
         time = TIME_UNITS[keys.time_unit] * time
     key = (path, len(time), keys.time, keys.time_unit, keys.rate_hz, keys.offset_s)
     clock = _once(contents, key, clocks.build_clock, time + keys.offset_s, source)

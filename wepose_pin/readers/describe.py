@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from ..body import BodyTable, load_table
 from ..data_tables import FORMATS as TABLES
-from ..data_tables import read_columns, read_first_lines, read_names, read_table
+from ..data_tables import read_first_lines, read_names, read_table, read_times
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
@@ -302,6 +303,9 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
         guess, kind = guess_arrays(content.shapes, body), "MATLAB" if path.suffix.lower() == ".mat" else "HDF5"
         about = Description(path, f"{kind} file, {len(names)} arrays")
     if not guess.sensors:
+        if content is None and all(re.fullmatch(r"[-+.,\deE\s]*", name) for name in names):
+            needed = "write the names of the columns above it; commas, semicolons or tabs separate them"
+            raise BadData(f"{path}: the first line holds numbers; {needed}")
         listed = one_of(names).removeprefix("there is: ")
         about.facts.append(f"no gyroscope and accelerometer, and no quaternions, by their names: {listed}")
         return about
@@ -335,19 +339,26 @@ def _propose_time(about: Description, guess: Guess, arrays: ArrayFile | None) ->
     place, data = str(about.path), about.data
     table = arrays.table(dict.fromkeys(guess.times, place)) if arrays else read_table(about.path)
     for name in guess.times:
-        with contextlib.suppress(BadData):  # dates, or another column of this name
-            time = read_columns(table, [name], place, "time")[:, 0]
+        with contextlib.suppress(BadData):  # text, or another column of this name
+            time = read_times(table, name, place, "time")
             break
     else:
         lines = () if arrays else read_first_lines(about.path)
-        missing = f"'{guess.times[0]}' does not hold numbers" if guess.times else "no column looks like time"
+        missing = f"'{guess.times[0]}' holds no times" if guess.times else "no column looks like time"
         if stated := next(filter(None, map(_STATED_RATE.search, lines)), None):
             data["rate_hz"] = float(stated["rate"])
             about.facts.append(f"{missing}; the file says '{stated[0]}'")
         else:
-            data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, missing
+            data["rate_hz"], about.checks["rate_hz"] = ASSUMED_RATE_HZ, f"a guess, as {missing}"
+            about.facts.append(f"{ASSUMED_RATE_HZ:g} Hz is a guess, as {missing}")
         return
     steps = np.diff(time)
+    if len(guess.sensors) == 1 and (steps <= 0.0).any():
+        for other in (column for column in table.drop(name) if 1 < column.n_unique() <= MOST_SIBLINGS):
+            rows = pl.DataFrame([pl.Series("time", time), other.alias("sensor")])
+            if rows.select((pl.col("time").diff().over("sensor") > 0.0).all()).item():
+                needed = "write a file for each sensor, named as its segment (torso.csv)"
+                raise BadData(f"{place}: rows of several sensors, told apart by '{other.name}'; {needed}")
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     named = guess.units.get(name)
     unit = named if named is not None and 0.0 < step * TIME_UNITS[named] < LONGEST_STEP_S else guess_time_unit(step)
