@@ -213,7 +213,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
         (["-o", "d", "--format", "lerobot", "--interval", "50", "60"], "the recording runs from 1.5 to"),
         (["-o", "x.mcap", "--episodes", "reach"], "--episodes reach: not of format mcap; only of format lerobot"),
         (["-o", "x.trc"], "is a robot's trajectory, for lerobot"),
-        (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
+        (["-o", "x.bag", "--format", "rosbag"], "x.bag: format rosbag is a folder; name it x"),
         (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
         (["{slow}", "-o", "d", "--format", "lerobot"], "robot arm, 25 Hz, joints"),
         (["{other}", "-o", "d", "--format", "lerobot"], "50 Hz, joints flexion; a data set has one robot"),

@@ -150,7 +150,10 @@ def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Pat
 def test_where_nothing_repeats_there_are_phases_all_the_same(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("angles", results[0], "-o", tmp_path / "a", "--phase", "start") == 0
+    assert run("angles", *results, "-o", tmp_path / "a") == 0
+    assert (
+        run("angles", results[0], "-o", tmp_path / "a", "--phase", "start", "--force") == 0
+    )  # the first's do not stay
     assert "no repetitions by right_elbow_flexion: the angle goes out and back" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "a").iterdir()} == {
         *("angles.csv", "sessions.csv", "phases.csv", "repetitions.svg", "angles.svg"),

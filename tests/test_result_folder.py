@@ -86,10 +86,10 @@ def test_what_a_session_in_the_folder_needs_is_not_replaced(
 
 
 def test_pages_of_an_earlier_result_do_not_outlive_it(session: Path, tmp_path: Path) -> None:
-    for name in ("view.html", "report.html"):
+    for name in ("view.html", "report.html", "torques.parquet"):
         (tmp_path / name).write_text("of another motion", encoding="utf-8")
     track(session, tmp_path)
-    assert not [name for name in contents(tmp_path) if name.endswith(".html")]
+    assert not [name for name in contents(tmp_path) if name.endswith(".html") or "torques" in name]
     (tmp_path / "view.html").mkdir()  # it is no page
     track_session(session, out=tmp_path, view=False, force=True)
     assert (tmp_path / "view.html").is_dir()

@@ -80,6 +80,8 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert re.search(r"At worst, at [\d.]+ s of the trajectory \([\d.]+ s of the recording\), the", report)
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert (code, "--force replaces" in text) == (2, True)
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(result), "--force")
+    assert (code, "pose.parquet: is of `wepose track`" in text) == (2, True)
 
 
 def test_the_exit_code_says_that_no_robot_should_run_it(

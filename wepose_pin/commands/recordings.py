@@ -136,7 +136,7 @@ def calibrate(
     if prior is not None and (stature is not None or sex is not None):
         needed = "has the lengths of a person; --stature and --sex narrow those of the population"
         raise WrongOption("prior", prior, needed)
-    with progress_bar() as progress, result_folder(out, force, ("report.html",)) as folder:
+    with progress_bar() as progress, result_folder(out, force, "calibrate") as folder:
         progress("reading", 0.0)
         recording = load_session(session, gaps=gaps)
         body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
@@ -219,13 +219,12 @@ def track(
     from ..body.subject import load_subject, parse_subject
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
-    from ..report.page import PAGES
     from ..report.pages import write_track_pages
     from ..tracking import CHUNK_S, Tracker, TrackSummary, track_chunks
     from ..writers.result import collect_provenance, result_folder, write_about, write_poses
 
     chosen = method or BEST
-    with progress_bar() as progress, result_folder(out, force, PAGES) as folder:
+    with progress_bar() as progress, result_folder(out, force, "track") as folder:
         progress("reading", 0.0)
         person = None if subject is None else load_subject(subject)
         if person is not None and not accept_failed:

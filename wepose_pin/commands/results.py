@@ -257,7 +257,9 @@ def angles(
     from ..writers import load_result, select_pose
     from ..writers.result import collect_provenance, write_provenance
 
-    with progress_bar() as progress, whole_folder(out, force, ("angles.html",)) as folder:
+    of_repetitions = ("repetitions.csv", "repetitions.svg", "summary.csv", "curves.csv", "curves-*.svg")
+    earlier = ("angles.html", "angles.svg", "angles-*.svg", *of_repetitions)
+    with progress_bar() as progress, whole_folder(out, force, earlier) as folder:
         # All are analysed by the sequence, the angle and the direction of the first that has repetitions.
         chosen: dict[str, Any] = {"sequence": shoulder, "cutoff_hz": low_pass_hz, "repetitions": repetitions}
         movements: list[Movement] = []

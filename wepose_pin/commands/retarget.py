@@ -57,17 +57,16 @@ def retarget(
     import json
 
     from .. import retargeting
-    from ..documents import whole_folder
     from ..report import retargeting as report_room
-    from ..report.page import PAGES, write_pages
+    from ..report.page import write_pages
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
     from ..writers import load_result, select_pose
-    from ..writers.result import as_json, collect_provenance
+    from ..writers.result import as_json, collect_provenance, result_folder
 
     names = ("robot", "arm", "task", "rate_hz", "scale", "smoothing_hz", "speed_scale", "limit_margin")
     chosen: dict[str, Any] = {name: options[name] for name in names}
-    with progress_bar() as progress, whole_folder(out, force, PAGES) as folder:
+    with progress_bar() as progress, result_folder(out, force, "retarget") as folder:
         progress("reading", 0.0)
         tracked = load_result(result)
         pose, body, name = select_pose(tracked, interval, phase), tracked.model, tracked.name

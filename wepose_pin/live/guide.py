@@ -83,7 +83,7 @@ class GuideOptions:
         )
         if isinstance(source, Path):
             stated = {"session": source, "measured": measured, "prior": self.subject, "method": self.method}
-            with result_folder(source.with_suffix(""), force=True, pages=("report.html",)) as folder:
+            with result_folder(source.with_suffix(""), force=True, command="calibrate") as folder:
                 write_calibration(folder, calibration, collect_provenance("calibrate", stated | {"protocol": protocol}))
                 page = partial(render_calibration_report, calibration, recording)
                 write_pages(folder, {"report.html": page})
@@ -227,7 +227,7 @@ class Guide(Stage):
 
     def accept(self, calibration: Calibration, result: Path) -> None:
         """Save the subject of the attempt's calibration, whose files are in the folder `result`, and end."""
-        with result_folder(self.options.folder, force=True, pages=("report.html",)) as folder:
+        with result_folder(self.options.folder, force=True, command="calibrate") as folder:
             for file in result.glob("*"):
                 shutil.copyfile(file, folder / file.name)
             write_segments(folder, self.segments)

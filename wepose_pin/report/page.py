@@ -20,7 +20,6 @@ if TYPE_CHECKING:  # matplotlib loads only where a figure is drawn
     from .figures import ReportFigure
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it
-PAGES = ("view.html", "report.html")  # of a result
 MOST_FIGURES = 5  # of a page; tables have the rest
 
 

@@ -21,7 +21,7 @@ from ..errors import reason
 from ..tracking import TrackResult, TrackSummary, summarize
 from ..tracking.summary import find_samples_after_start, finite_median, measure_reach
 from ..writers.result import CALL, collect_provenance, result_folder, write_about, write_poses
-from .page import PAGES, write_pages
+from .page import write_pages
 from .viewer import FRAMES_A_SECOND, compute_angles, pose_html
 from .words import explain_no_covariance, listed, name_tips, plain
 
@@ -97,7 +97,7 @@ def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:
     """Write what `wepose track -o` writes, whole or not at all, and return the folder; as `TrackResult.save`."""
     out, source = Path(folder), result.source
-    with result_folder(out, force, PAGES) as partial:
+    with result_folder(out, force, "track") as partial:
         if isinstance(source, Path):
             for file in source.iterdir():
                 if file.is_file():

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from ..body.urdf import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..recording import find_runs, format_span
-from ..writers.motion import ROBOT_URDF, TRAJECTORY
-from ..writers.result import write_table
+from ..writers.motion import ROBOT_URDF
+from ..writers.result import TRAJECTORY, write_table
 from .collision import copy_checked_shapes
 from .maps import RobotMap
 from .robot import Robot

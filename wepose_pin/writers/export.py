@@ -21,10 +21,10 @@ from ..errors import BadData, BadOption, one_of
 from ..libraries import check_file, find_plugins, load_plugin
 from ..tracking import TrackResult
 from .joints import write_lerobot, write_mcap, write_rosbag, write_rrd
-from .motion import ROBOT_URDF, TRAJECTORY, HasJointMotion, check_rate, convert_person, read_joint_motion, resample
+from .motion import ROBOT_URDF, HasJointMotion, check_rate, convert_person, read_joint_motion, resample
 from .motion_capture import write_bvh, write_c3d
 from .opensim import write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
-from .result import SUBJECT_URDF, format_urdf, load_result, select_pose, write_table
+from .result import SUBJECT_URDF, TRAJECTORY, format_urdf, load_result, select_pose, write_table
 
 Result = TrackResult | HasJointMotion | str | Path
 # What a format is of: a person's motion; joints of a person or a robot; motions of robots; a body without a motion.

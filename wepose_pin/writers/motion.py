@@ -27,9 +27,9 @@ from ..recording import Intervals, select_interval
 from ..recording.clocks import interpolate
 from ..rotations import multiply
 from ..tracking import TrackResult
-from .result import read_phases
+from .result import TRAJECTORY, read_phases
 
-TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
+ROBOT_URDF = "robot.urdf"
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
 SLACK_S = 1e-6  # [s] by which times that are written with digits differ

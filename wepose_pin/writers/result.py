@@ -17,7 +17,7 @@ import re
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -46,7 +46,7 @@ from ..readers import format_keys
 from ..recording import ImuSensor, Intervals, Recording, find_mount_axes, select_interval
 from ..tracking import TrackResult, TrackSummary
 
-POSE = "pose.parquet"
+POSE, TRAJECTORY = "pose.parquet", "trajectory.parquet"
 JOINTS = "joints.parquet"
 SUBJECT_URDF = "subject.urdf"
 ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
@@ -396,21 +396,34 @@ def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
 # Folders that hold an earlier result, or files of the user ---------------------------------------------------------
 
 
-@contextmanager
-def result_folder(out: Path, force: bool, pages: Sequence[str] = ()) -> Iterator[Path]:
-    """`whole_folder` of a result; files of an earlier one are deleted if they are `pages` or read with a result.
+# Command → the file that tells its folder, and others that may be of an earlier run.
+_WRITTEN = {
+    "calibrate": ("calibration.json", "report.html"),
+    "track": (POSE, "torques.parquet", "view.html", "report.html"),
+    "retarget": (TRAJECTORY, "view.html", "report.html"),
+}
 
-    `ExistingOutput` is raised where a file of the user's would be read with the result, or an input be replaced.
+
+@contextmanager
+def result_folder(out: Path, force: bool, command: str) -> Iterator[Path]:
+    """`whole_folder` of what a command writes; files of an earlier run do not stay.
+
+    `ExistingOutput` is raised where the folder is of another command, a file of the user's would be read with the
+    result, or an input be replaced.
     """
+    for other, (name, *_) in _WRITTEN.items():
+        if other != command and (out / name).exists():
+            why = f"is of `wepose {other}`, whose files would be replaced"
+            raise ExistingOutput(f"{out / name}: {why}; name another folder")
     inputs = {file.resolve() for file in list_files(out, truth=True)} if (out / "session.toml").is_file() else set()
     stale = [name for name in (MODEL_TABLE, JOINTS) if (out / name).exists()]
     if stale and not any((out / name).is_file() for name in INSIDE):
         why = "is of no earlier result, and would be read with the new one"
-        raise ExistingOutput(f"{out / stale[0]}: {why}; rename it, or name another folder by -o")
+        raise ExistingOutput(f"{out / stale[0]}: {why}; rename it, or name another folder")
     stale = [name for name in stale if (out / name).resolve() not in inputs]
-    with whole_folder(out, force, (*stale, *pages)) as folder:
+    with whole_folder(out, force, (*stale, *_WRITTEN[command])) as folder:
         yield folder
         for name in sorted(file.name for file in folder.iterdir()):
             if (out / name).resolve() in inputs:
                 why = f"is an input of {out / 'session.toml'}, and would be replaced"
-                raise ExistingOutput(f"{out / name}: {why}; name another folder by -o")
+                raise ExistingOutput(f"{out / name}: {why}; name another folder")
