@@ -178,7 +178,9 @@ def test_a_late_start_pose_and_what_came_before_it() -> None:
 @pytest.mark.parametrize(("forward_deg", "aside_deg", "is_bad"), [(140.0, 0.0, 0), (-30.0, 0.0, 1), (90.0, 80.0, 1)])
 def test_elbows_that_cannot_be(forward_deg: float, aside_deg: float, is_bad: int) -> None:
     """Backwards, and out of the plane."""
-    hinges = [each for each in elbow(forward_deg, aside_deg).diagnostics if each.code.startswith("hinge-")]
+    result = elbow(forward_deg, aside_deg)
+    hinges = [each for each in result.diagnostics if each.code.startswith("hinge-")]
+    assert ("No ± holds" in text_of(report(result))) == is_bad
     assert [(each.code, each.place) for each in hinges] == [("hinge-implausible", "left_elbow")] * is_bad
     assert all(np.degrees(each.value or 0.0) > 29.0 for each in hinges)
 

@@ -27,6 +27,7 @@ from .words import explain_no_covariance, listed, name_tips, plain
 
 FRAME_HEIGHT = 560  # [px] of the view page in a notebook
 MOST_FRAMES_INSIDE = 3000  # of the view inside a report
+_CONTRADICTIONS = ("mount-contradicted", "heading-corrected-far", "hinge-implausible")  # beside them a ± means nothing
 
 
 def write_track_pages(
@@ -53,7 +54,7 @@ def write_track_pages(
         return render_track_report(summary, reliance, angles(), page)
 
     try:
-        reliance = describe_reliance(tracked, angles())
+        reliance = describe_reliance(summary, angles())
     except Exception as error:  # the result is complete without it
         reliance = f"How far the motion can be trusted cannot be said: {reason(error)}"
     whole = partial(make_view, FRAMES_A_SECOND) if view else None
@@ -61,8 +62,12 @@ def write_track_pages(
     return reliance, write_pages(folder, pages)
 
 
-def describe_reliance(tracked: TrackResult, angles: Angles | None) -> str:
+def describe_reliance(summary: TrackSummary, angles: Angles | None) -> str:
     """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
+    wrong = {each["text"]["title"]: None for each in summary.content["diagnostics"] if each["code"] in _CONTRADICTIONS}
+    if wrong:
+        return f"**No ± holds** while a mount, a heading or a sensor's name is wrong: {'; '.join(wrong)}."
+    tracked = summary.tracked
     after_start, table = find_samples_after_start(tracked), tracked.model.table
     lost = np.logical_or.reduce([np.zeros(len(after_start), dtype=bool), *tracked.pose.gap.values()])
     lost_share, known = lost[after_start].mean(), after_start & ~lost
