@@ -284,15 +284,3 @@ def test_a_unit_that_nothing_shows_is_to_be_checked(capsys: pytest.CaptureFixtur
     assert 'gyro_unit = "rad/s"   # CHECK: ' in info(capsys, write_swing(tmp_path / "a.csv", 1.0, deg=0.0))
     stated = write_swing(tmp_path / "b.csv", 1.0, "torso_gyr_{} [rad/s]", deg=0.0)
     assert 'gyro_unit = "rad/s"\n' in info(capsys, stated)
-
-
-def test_a_folder_with_a_file_for_each_sensor(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    for k, segment in enumerate(("left_forearm", "left_upper_arm", "torso", "imu7")):
-        write_swing(tmp_path / f"{segment}.csv", 1.0 + 0.1 * k, "gyr_{}")
-    (tmp_path / "a_list.csv").write_text("file,person\ntorso.csv,anna\n")
-    session = tmp_path.parent / f"{tmp_path.name}.toml"
-    assert "also in the folder, not used: a_list.csv\n" in info(capsys, tmp_path, "-o", str(session))
-    assert f'# [sensors.SEGMENT]\n# file = "{tmp_path.name}/imu7.csv"' in session.read_text(encoding="utf-8")
-    recording = wp.load_session(session)
-    assert set(recording.sensors) == {"torso", "left_upper_arm", "left_forearm"}
-    assert recording.name == tmp_path.name

@@ -135,15 +135,21 @@ def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFix
         wp.load_session(tmp_path / "session.toml", gaps=True)
 
 
-def test_a_file_for_each_sensor_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """Not the other recording of the same name, nor a table of something else."""
+def test_a_folder_with_a_file_for_each_sensor(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Not a table of something else; a name that tells no segment leaves it to the user."""
     names = ",".join(["t_ms", *(f"{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])
     time = [str(10 * k) for k in range(N)]
-    for k, name in enumerate(("chest", "left_wrist", "right_wrist_2")):
+    for k, name in enumerate(("chest", "left_wrist", "right_wrist_2", "imu7")):
         (tmp_path / f"{name}.csv").write_text(names + "\n" + lines(time, values(k), ","))
-    (tmp_path / "right_upper_arm.csv").write_text("t_ms,emg\n0,1\n")
-    assert "CSV table, 7 columns, 3 files" in info(capsys, tmp_path / "left_wrist.csv", "--write")
-    recording = wp.load_session(tmp_path / "session.toml")
+    for name in ("a_list", "right_upper_arm"):
+        (tmp_path / f"{name}.csv").write_text("t_ms,emg\n0,1\n")
+    session = tmp_path.parent / f"{tmp_path.name}.toml"
+    out = info(capsys, tmp_path, "-o", session)
+    assert "CSV table, 7 columns, 4 files" in out
+    assert "also in the folder, not used: a_list.csv, right_upper_arm.csv\n" in out
+    assert f'# [sensors.SEGMENT]\n# file = "{tmp_path.name}/imu7.csv"' in session.read_text(encoding="utf-8")
+    recording = wp.load_session(session)
+    assert recording.name == tmp_path.name
     assert set(recording.sensors) == {"torso", "left_forearm", "right_forearm"}
     np.testing.assert_allclose(recording.sensors["left_forearm"].gyro_S, values(1)[:, 3:], atol=1e-5)
 
