@@ -84,7 +84,7 @@ def _describe_reliance(summary: pl.DataFrame) -> str:
         if np.isfinite(row["range_sd_deg"]):
             between[angle] = row["range_sd_deg"]
     if not between:
-        return "No repetitions were found, so this page has no mean curves. The table covers the whole recording."
+        return "No repetitions were found, so this page has no mean curves."
     worst = max(between, key=between.__getitem__)
     varies = f"Between repetitions the range of {worst} varies most, by ± {between[worst]:.1f}°."
     if not stated:
@@ -117,7 +117,7 @@ def tabulate_sessions(sessions: pl.DataFrame) -> Table:
             f"{plain(row['repetitions_by'])} {row['first']}".strip(),
             str(row["n"]),
             plus_minus(row["duration_mean_s"], row["duration_sd_s"], " s", 2) if row["n"] else "",
-            number(row["cmc"], 2, unknown=""),
+            number(row["cmc"], 2, unknown="") if row["n"] else "",
             str(row["left_out"] or ""),
         ]
         for row in sessions.iter_rows(named=True)
@@ -185,7 +185,8 @@ def draw_joint_angles(angles: Angles, caption: str = "Joint angles over time.") 
 
 def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure:
     """The angle by which repetitions were found over time, a row a session."""
-    figure = ReportFigure("The main angle over time. Shaded, in turns: the repetitions.", 1.5 * len(repeating))
+    shaded = " Shaded, in turns: the repetitions." * any(len(each.repetitions.spans) for _, each in repeating)
+    figure = ReportFigure(f"The main angle over time.{shaded}", 1.5 * len(repeating))
     for ax, (k, movement) in zip(figure.grid(len(repeating))[:, 0], repeating, strict=True):
         spans, source = movement.repetitions.spans, movement.repetitions.source
         joint, place = list_angles(movement.angles)[source]

@@ -59,10 +59,13 @@ def _describe_reliance(calibration: Calibration) -> str:
     """Two sentences: how well the lengths are known, and the mounts."""
     subject, chain = calibration.subject, calibration.problem.layout.lengths_in_closures
     stds = {name: std for name in chain or subject.lengths if np.isfinite(std := 1e3 * subject.std(name))}
+    if calibration.quality.quality == "fail":
+        return "**No ± holds:** the calibration failed."
     text = "The uncertainty of the lengths is not known."
     if stds:
         worst = max(stds, key=stds.__getitem__)
-        text = f"Lengths are known to ± {stds[worst]:.0f} mm or better ({plain(worst)})"
+        which = "Lengths that the motion determines" if chain else "Lengths"
+        text = f"{which} are known to ± {stds[worst]:.0f} mm or better ({plain(worst)})"
         scale = f", their common scale to ± {100 * calibration.scale_std:.1f} %."
         text += scale if chain and np.isfinite(calibration.scale_std) else "."
         if calibration.formulation == "paper":
