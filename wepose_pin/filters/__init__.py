@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,10 +18,11 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..arguments import Positive, check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
-from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
+from ..errors import BadData, BadOption, BadPhase, WeposeWarning, WrongUnit, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.faults import check_arrays, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
+from ..recording.plausibility import SHORTEST_WINDOW_S, check_gyro
 from .amekf import AMEKF
 from .amekf import AmekfParams as AmekfParams
 from .base import Orientation as Orientation
@@ -29,7 +31,15 @@ from .base import join_orientations as join_orientations
 from .complementary import GDC, NCF
 from .complementary import GdcParams as GdcParams
 from .complementary import NcfParams as NcfParams
-from .phases import MOVING_TILT_STD, TYPICAL, SensorNoise, estimate_noise, estimate_start_tilt
+from .phases import (
+    MOVES_DEG_S,
+    MOVING_TILT_STD,
+    TYPICAL,
+    SensorNoise,
+    check_gravity_norm,
+    estimate_noise,
+    estimate_start_tilt,
+)
 from .smekf import PUBLISHED_SMEKF, SMEKF
 from .smekf import SmekfParams as SmekfParams
 from .smoother import SMOOTHER
@@ -290,17 +300,27 @@ def estimate_orientation(
                 f"{name} has a value of {largest:.6g}: no sensor measures above {most:g} {unit}; check the unit"
             )
     check_arrays("", rate_hz, {"": (gyro, accel)})
-    noise, start, diagnostics = TYPICAL, None, tuple[Diagnostic, ...]()
+    sensor = ImuSensor(gyro, accel, gyro_range=find_gyro_range(gyro, accel))
+    # Seconds about the fastest motion show a wrong unit; a check of all samples takes as long as a filter.
+    fastest, size = int(gyro.argmax()) // 3, math.ceil(SHORTEST_WINDOW_S * rate_hz)
+    part = sensor.part(slice(max(0, fastest - size), fastest + size))
+    try:
+        diagnostics = tuple(check_gyro("", part, rate_hz, "sensor"))
+    except WrongUnit as error:
+        raise BadData(f"{error.finding}; are the rates in {error.unit}, or is rate_hz wrong?") from None
+    noise, start = TYPICAL, None
     if static is None:
         facts = {"method": method} | ({"variant": "estimated"} if method in ("amekf", "smoother") else {})
-        diagnostics = (Diagnostic("static-phase-missing", WARNING, facts=facts),)
-        warnings.warn(join_text(render(diagnostics[0])), WeposeWarning, stacklevel=2)
+        diagnostics += (Diagnostic("static-phase-missing", WARNING, facts=facts),)
+        warnings.warn(join_text(render(diagnostics[-1])), WeposeWarning, stacklevel=2)
+        check_gravity_norm(float(np.linalg.norm(part.accel_S, axis=1).mean()), "in the fastest motion")
     else:
         first, last = np.round(np.multiply(static, rate_hz)) + (0.0, 1.0)
         if not 0.0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
         start = slice(int(first), int(last))
         noise = estimate_noise(gyro[start], accel[start], rate_hz)
-    sensor = ImuSensor(gyro, accel, gyro_range=find_gyro_range(gyro, accel))
+        if (rate_deg_s := float(np.degrees(np.sqrt(np.trace(noise.gyro_cov))))) > MOVES_DEG_S:
+            raise BadPhase(f"static = {static} [s]: the sensor turns at {rate_deg_s:.0f} deg/s rms; name other seconds")
     filters = SensorFilters({"": noise}, method=method, params=params, static_test=static_test, start=start)
     return filters.push(Recording("", np.empty(len(gyro)), rate_hz, {"": sensor}))[""]._replace(diagnostics=diagnostics)

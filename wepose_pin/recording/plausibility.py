@@ -57,7 +57,7 @@ def check_signals(
     for segment, sensor in imus.items():
         place, gyro_S, accel_S = f"{where}: sensors.{segment}", sensor.gyro_S, sensor.accel_S
         diagnostics += _check_gravity(time, rate_hz, phases, segment, sensor, place)
-        diagnostics += _check_gyro(segment, sensor, rate_hz, place)
+        diagnostics += check_gyro(segment, sensor, rate_hz, place)
         for name, values, most, unit, saturated in (
             ("gyro", gyro_S, HIGHEST_RATE, "rad/s", np.abs(gyro_S) >= sensor.gyro_range),
             ("accel", accel_S, HIGHEST_ACCEL, "m/s^2", find_saturation(accel_S, NARROWEST_ACCEL_RANGE)),
@@ -117,7 +117,7 @@ def _check_gravity(
     return [Diagnostic("accel-scale", WARNING, segment, share, GRAVITY_ERROR_NOTED, facts)]
 
 
-def _check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> list[Diagnostic]:
+def check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> list[Diagnostic]:
     """Compare the rates with the motion of gravity: `WrongUnit`, or a diagnostic of other axes, signs or scale."""
     size = min(round(WINDOW_S * rate_hz), len(sensor.gyro_S) // FEWEST_WINDOWS)
     if size < SHORTEST_WINDOW_S * rate_hz:
