@@ -239,12 +239,9 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
     rng = np.random.default_rng(0)
     gyro, accel = rng.normal(scale=1e-3, size=(900, 3)), rng.normal(scale=1e-2, size=(900, 3)) + [0.0, 0.0, 9.81]
     swing = np.sin(np.arange(900) / 50.0)[:, None]
-    for wrong, match in (
-        ((1e200 * gyro, accel), r"^gyro_S .* rad/s"),
-        ((gyro, 1e3 * accel), r"^accel_S .* m/s\^2"),
-        ((gyro + 20.0 * swing, accel), "are the rates in deg/s"),
-        ((gyro + swing * [0.0, 0.0, 1.0], accel), r"static = .* turns at 4\d deg/s"),
-    ):
+    beyond = ((1e200 * gyro, accel), r"^gyro_S .* rad/s"), ((gyro, 1e3 * accel), r"^accel_S .* m/s\^2")
+    deg_s, moving = gyro + 20.0 * swing, gyro + swing * [0.0, 0.0, 1.0]
+    for wrong, match in (*beyond, ((deg_s, accel), "are the rates in deg/s"), ((moving, accel), r"turns at 4\d deg/s")):
         with pytest.raises(WeposeError, match=match):
             wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
 

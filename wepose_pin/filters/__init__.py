@@ -303,7 +303,8 @@ def estimate_orientation(
     sensor = ImuSensor(gyro, accel, gyro_range=find_gyro_range(gyro, accel))
     # Seconds about the fastest motion show a wrong unit; a check of all samples takes as long as a filter.
     fastest, size = int(gyro.argmax()) // 3, math.ceil(SHORTEST_WINDOW_S * rate_hz)
-    part = sensor.part(slice(max(0, fastest - size), fastest + size))
+    begin = max(0, min(fastest - size, len(gyro) - 2 * size))
+    part = sensor.part(slice(begin, begin + 2 * size))
     try:
         diagnostics = tuple(check_gyro("", part, rate_hz, "sensor"))
     except WrongUnit as error:
