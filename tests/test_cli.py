@@ -107,6 +107,7 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
     # The truth as CSV, and against itself.
     pl.read_parquet(tmp_path / "truth.parquet").write_csv(tmp_path / "truth.csv")
     assert run("evaluate", tmp_path / "result", tmp_path / "truth.csv") == 0
+    assert wp.evaluate(wp.load_result(tmp_path / "result"), str(tmp_path / "truth.csv")).attitude
 
 
 def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Path) -> None:

@@ -137,7 +137,6 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert cells == sorted(cells), "in the order of the body"
     assert "cannot be made" not in page
     assert run("angles", *results, "-o", out) == 2  # nothing is overwritten
-    assert "--force" in capsys.readouterr().err
 
 
 def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Path) -> None:

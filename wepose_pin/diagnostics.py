@@ -171,7 +171,7 @@ class _Formatter(Formatter):
 
 
 def _fill(template: str, known: Mapping[str, Any]) -> str:
-    text = _Formatter().vformat(template, (), known)
+    text = _Formatter().vformat(template, (), known).replace("  ", " ")  # a sensor alone has no name
     # A name at the beginning of a sentence; a file's name stays as it is.
     return text[:1].upper() + text[1:] if re.match(r"\{\w+:name\}", template) else text
 

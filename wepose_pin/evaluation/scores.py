@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ from .. import rotations
 from ..angles import euler, joint_angles
 from ..arguments import check_arguments
 from ..body import BodyTable, load_table
-from ..body.kinematics import Pose
+from ..body.kinematics import Pose, parse_pose_table
+from ..data_tables import read_table
 from ..errors import BadData, BadOption
 from ..recording import format_span
 from ..tracking import TrackResult
@@ -100,7 +102,7 @@ class Evaluation:
 
 def evaluate(
     pose: Pose | TrackResult,
-    truth: Pose | TrackResult,
+    truth: Pose | TrackResult | str | Path,
     interval: tuple[float, float] | None = None,
     table: BodyTable | None = None,
 ) -> Evaluation:
@@ -110,8 +112,9 @@ def evaluate(
     ----------
     pose : TrackResult or Pose
         What `track` or `load_result` gives, or its `pose`.
-    truth : TrackResult or Pose
-        The reference; where it is NaN, or has no sample near a time of the pose, that time is left out.
+    truth : TrackResult or Pose, str or Path
+        The reference, or a table (.parquet, .csv) with the columns of pose.parquet; where it is
+        NaN, or has no sample near a time of the pose, that time is left out.
     interval : (float, float), optional
         Use only this time of the recording, from and to in seconds.
     table : BodyTable, optional
@@ -142,6 +145,8 @@ def evaluate(
     check_arguments(evaluate, locals())
     if isinstance(pose, TrackResult):
         table, pose = table or pose.model.table, pose.pose
+    if isinstance(truth, str | Path):
+        truth = parse_pose_table(read_table(Path(truth)), str(truth))
     if isinstance(truth, TrackResult):
         truth = truth.pose
     if interval is not None and not interval[0] < interval[1]:

@@ -165,13 +165,16 @@ class Recording:
             if mounts and segment in mounts:
                 axes = dict(zip(("up", "forward"), mounts[segment], strict=False))
                 mount = compute_mount(*read_axes(TomlTable(axes, "mounts", f"{segment}.", BadOption)))
-            if isinstance(values, np.ndarray):
-                built[segment] = OrientationSensor(values, mount)
-            elif isinstance(values, tuple) and len(values) == 2:
-                built[segment] = ImuSensor(*values, mount)
+            arrays: tuple[Any, ...] = values if isinstance(values, tuple) else (values,)
+            shapes = [getattr(each, "shape", type(each).__name__) for each in arrays]
+            if [shape[1:] for shape in shapes] == [(4,)]:
+                built[segment] = OrientationSensor(arrays[0], mount)
+            elif [shape[1:] for shape in shapes] == [(3,), (3,)]:
+                built[segment] = ImuSensor(arrays[0], arrays[1], mount)
             else:
-                raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
-            count = count or len(np.atleast_1d(values[0] if isinstance(values, tuple) else values))
+                needed = "the arrays gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed"
+                raise BadData(f"{segment}: {needed}, not {' and '.join(map(str, shapes))}")
+            count = count or len(arrays[0])
         recording = cls(name, np.arange(count) / rate_hz, rate_hz, built, phases or {}).check()
         check_arrays(f"{name}: sensors.", rate_hz, {each: (s.gyro_S, s.accel_S) for each, s in recording.imus.items()})
         for each, imu in recording.imus.items():
@@ -194,7 +197,7 @@ class Recording:
         check_fields(self, f"{where}: ")
         count = len(time)
         if not self.sensors:
-            raise BadData(f"{where}: no sensors; one [sensors.<segment>] table each")
+            raise BadData(f"{where}: no sensors; at least one is needed")
         if count < 2:
             raise BadData(f"{where}: time has {count} samples; a recording has at least 2")
         check_array(f"{where}: time", time, (count,), kind="missing")

@@ -11,6 +11,7 @@ import polars as pl
 from ..angles import Angles, group_sides
 from ..angles.movement import MEASURES, Movement
 from ..angles.repetitions import PERCENT, list_angles
+from ..recording import format_span
 from . import figures as fig
 from .figures import Figures, ReportFigure, styled
 from .page import MOST_FIGURES, render_page
@@ -113,7 +114,7 @@ def tabulate_sessions(sessions: pl.DataFrame) -> Table:
     rows = [
         [
             row["session"],
-            f"{row['from_s']:g} to {row['to_s']:g} s",
+            format_span((row["from_s"], row["to_s"])),
             f"{plain(row['repetitions_by'])} {row['first']}".strip(),
             str(row["n"]),
             plus_minus(row["duration_mean_s"], row["duration_sd_s"], " s", 2) if row["n"] else "",

@@ -177,7 +177,7 @@ def diagnose_trajectory(
             diagnostics.append(Diagnostic("robot-hand-off-target", WARNING, arm.side, error, LOST_M, facts))
     if (slowest := trajectory.slowest) is not None and slowdown is not None:
         about = {"joint": slowest["joint"], "quantity": slowest["quantity"], "moment": slowest["time"]}
-        diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=about))
+        diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown - 1.0, facts=about))
     if stopping := int(trajectory.report.stopping.sum()):
         diagnostics.append(Diagnostic("robot-stopped-for-clearance", WARNING, name, stopping))
     return diagnostics
