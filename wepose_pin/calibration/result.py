@@ -292,8 +292,8 @@ def _find_cause(calibration: Calibration, rotations: Mapping[str, float], spine:
     own = [rotations[name] for name in ([table.reference] if spine else limbs) if name in rotations]
     if own and min(own) < enough and not table.is_mechanism:
         return Diagnostic("motion-too-small", WARNING, "", min(own), float(enough), {"variant": variant})
-    if calibration.effective_sample_size < ENOUGH_SAMPLES:
-        return Diagnostic("motion-too-small", WARNING, "", calibration.effective_sample_size, ENOUGH_SAMPLES)
+    if (size := calibration.effective_sample_size) < ENOUGH_SAMPLES:
+        return Diagnostic("motion-too-small", WARNING, "", size, facts={"variant": "cause"})
     return None
 
 
