@@ -36,7 +36,6 @@ from .phases import (
     MOVING_TILT_STD,
     TYPICAL,
     SensorNoise,
-    check_gravity_norm,
     estimate_noise,
     estimate_start_tilt,
 )
@@ -314,7 +313,6 @@ def estimate_orientation(
         facts = {"method": method} | ({"variant": "estimated"} if method in ("amekf", "smoother") else {})
         diagnostics += (Diagnostic("static-phase-missing", WARNING, facts=facts),)
         warnings.warn(join_text(render(diagnostics[-1])), WeposeWarning, stacklevel=2)
-        check_gravity_norm(float(np.linalg.norm(part.accel_S, axis=1).mean()), "in the fastest motion")
     else:
         first, last = np.round(np.multiply(static, rate_hz)) + (0.0, 1.0)
         if not 0.0 <= first < last <= len(gyro) + 1:

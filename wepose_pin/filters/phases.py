@@ -85,7 +85,9 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     if n < 10:
         raise BadPhase(f"the static phase holds {n} samples; at least 10 are needed to measure noise")
     gravity = float(np.sqrt(np.einsum("ni,ni->n", accel_S, accel_S)).mean())
-    check_gravity_norm(gravity, "in the static phase")
+    if not GRAVITY_RANGE[0] < gravity < GRAVITY_RANGE[1]:
+        needed = "specific force in m/s² is needed, 9.8 upwards when static"
+        raise BadPhase(f"accel_S is {gravity:.3g} in the static phase, which is no gravity; {needed}")
     size, accel = max(1, round(BLOCK_S * rate_hz)), accel_S / gravity
     blocks, gyro_cov = n // size, _compute_cov(gyro_S)
     # Means of blocks average white noise out and keep sway; less than four show none.
@@ -109,13 +111,6 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
         accel_step_var=_compute_step_var(accel),
         gyro_half_second_cov=half_second_cov,
     )
-
-
-def check_gravity_norm(norm: float, when: str) -> None:
-    """Raise `BadPhase` where a mean norm of accel [m/s²] is no gravity."""
-    if not GRAVITY_RANGE[0] < norm < GRAVITY_RANGE[1]:
-        needed = "specific force in m/s² is needed, 9.8 upwards when static"
-        raise BadPhase(f"accel_S is {norm:.3g} {when}, which is no gravity; {needed}")
 
 
 def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray) -> np.ndarray:
