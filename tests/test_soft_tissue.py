@@ -56,7 +56,7 @@ def test_who_repeats_the_tilts_of_the_start_pose_repeats_its_headings() -> None:
 def test_a_hinge_shows_how_far_skin_lags_behind_a_twist(size: float) -> None:
     person = simulate_person(3)
     sizes = replace(IDEAL_PRESET, tissue_gain=size, sensor_place=1.0)
-    made = simulate(person.lengths, seed=3, imperfections=sizes, clasp_s=30.0, circles=1, rate_hz=50.0)
+    made = simulate(person.lengths, seed=3, imperfections=sizes, clasp_s=40.0, circles=2)
     recording = made.recording()
     subject = calibrate(recording, measured=person.measured, prior=person.prior).subject
     tracked = track(recording, subject)

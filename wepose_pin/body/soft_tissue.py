@@ -16,7 +16,7 @@ from .table import ZERO, BodyTable, SoftTissue
 LEAST_TWIST_COSINE = 0.1
 # Of simulated people: the angle [rad] by which a forearm leaves the plane of its elbow, geometric mean, and how far its
 # logarithm scatters. The logarithm of a person's size of soft tissue has a standard deviation among people, assumption.
-USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(5.3), 0.25
+USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(3.5), 0.15
 SCATTER_LOG_STD = 0.5
 # Tilts of simulated people's arms in the start pose, as a share of what the table states, geometric mean. The logarithm
 # of a segment's share scatters about that of its person, which scatters as that of soft tissue; assumptions.

@@ -29,7 +29,7 @@ Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
 # [rad] by which the plane of a hinge is rotated about the segment above it against that segment's frame; assumption, of
 # simulated people, whose forearms bend aside as they turn.
-HINGE_PLANE_STD = np.deg2rad(10.0)
+HINGE_PLANE_STD = np.deg2rad(7.0)
 MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person has
 
 # Limits of a file; whether numbers are plausible says the quality of the calibration.
@@ -51,6 +51,8 @@ class Hinge(NamedTuple):
     std: Annotated[NonNegative, Key(unit="deg", least=0.0, most=57.3, digits=3)]
     # [rad/rad] by which the sensor above lags behind the twist that it shows; None: not known
     twist_lag: Annotated[float | None, Key(least=-10.0, most=10.0, digits=4)] = None
+    # [rad/rad] by which the segment below leaves the plane as it turns about its long axis; None: not known
+    per_twist: Annotated[float | None, Key(least=-1.0, most=1.0, digits=4)] = None
 
 
 @dataclass(frozen=True)

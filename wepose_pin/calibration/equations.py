@@ -14,9 +14,10 @@ stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(st
 with ψ the heading, d its drift over the time τ since the start, and A the rotation of a sensor on a foam, which gives
 as the direction of gravity in the segment changes. Skin lags behind a bone that twists: a segment above a hinge has
 turned further than its sensor about its long axis, by g times the sine of the twist that the sensor shows against the
-segment above it. A segment's points may move, as the shoulders do by collarbones and shoulder blades while the arms are
-raised (`body.girdle`). d, A, g and the hinges are nuisance parameters: the covariance of lengths and mounts includes
-their effect.
+segment above it. A forearm that pronates goes inwards: it leaves the plane of its hinge by c times the sine of its
+twist against the upper arm. A segment's points may move, as the shoulders do by collarbones and shoulder blades while
+the arms are raised (`body.girdle`). d, A, g, c and the hinges are nuisance parameters: the covariance of lengths and
+mounts includes their effect.
 
 Each sample belongs to one condition of the protocol. A closure gives the gap, whitened by the covariance that errors of
 the orientations and slipping palms give it, and of each hinge the sine of the angle by which the segment that it moves
@@ -38,7 +39,6 @@ import numpy as np
 from ..body import BodyModel
 from ..body.girdle import PARAMETERS
 from ..body.mounts import find_start_pose
-from ..body.soft_tissue import LEAST_TWIST_COSINE
 from ..body.subject import Subject
 from ..errors import BadSubject
 from ..observations import (
@@ -46,6 +46,7 @@ from ..observations import (
     about_z,
     express_covariance,
     express_deviation,
+    express_twist,
     find_girdles,
     find_hinges,
     product,
@@ -94,6 +95,8 @@ class Layout:
         # Hinges that show how the segment above them twists against the one above that, both with sensors.
         twisting = [name for name, own in tissues.items() if own.per_twist and own.relative_to in self.sensors]
         self.twists = [hinge for hinge in self.hinges if hinge.on in twisting]
+        # Hinges whose segment below leaves the plane by c times its twist.
+        self.carried = [hinge.name for hinge in self.hinges if hinge.per_twist_std]
         self.soft = [name for name in self.sensors if any(table.segments[name].foam_std)]  # sensors on a foam
         self.attitude_std = dict[str, float]()  # [rad] of each orientation about an axis across its segment
         for name, tissue in tissues.items():
@@ -115,6 +118,7 @@ class Layout:
         self.hinge = place(len(self.hinges), 2)  # of its axis along `across` and `tilted`
         self.foam = place(len(self.soft), 9)  # A [rad], column by column
         self.twist = place(len(self.twists))  # g
+        self.carrying = place(len(self.carried))  # c
         self.girdle = place(len(self.girdles), len(PARAMETERS))  # `body.girdle.PARAMETERS`
         # Closure → the places of its fixed point of W, or the place of its plane's height [m].
         self.unknown = {closure: place(3) for closure in self.paths if closure.kind == "fixed_point"}
@@ -172,9 +176,10 @@ def _express_residuals(layout: Layout, condition: Condition) -> tuple[ca.Functio
         start = _start_rotation(layout, x, condition.segment)
         r[0] = (rotate(quat_WL[condition.segment], condition.axis) - rotate(start, condition.axis))[2] / condition.std
     if isinstance(condition, Closure | FreeMotion):
+        carrying = dict(zip(layout.carried, ca.vertsplit(x[layout.carrying]), strict=True))
         for i, hinge in enumerate(layout.hinges):
-            error = x[layout.hinge[i]]
-            hinges[i] = express_deviation(hinge, quat_WL[hinge.on], quat_WL[hinge.moves], error) / HINGE_STD
+            both, c = (quat_WL[hinge.on], quat_WL[hinge.moves]), carrying.get(hinge.name, hinge.per_twist)
+            hinges[i] = express_deviation(hinge, *both, x[layout.hinge[i]], c) / HINGE_STD
     r = ca.cse(ca.vertcat(r, hinges))
     jacobian = ca.cse(ca.densify(ca.jacobian(r, x)).T)
     return ca.Function("residuals", [x, data], [r, ca.densify(gap)]), ca.Function("jacobian", [x, data], [jacobian])
@@ -192,12 +197,9 @@ def _orient_segments(layout: Layout, x: ca.SX, data: ca.SX) -> dict[str, ca.SX]:
             quat = product(quat, small_rotation(A @ (rotate_back(quat, up) - up)))
         quat_WL[name] = quat
     for hinge, lag in zip(layout.twists, ca.vertsplit(x[layout.twist]), strict=True):
-        name, along = hinge.on, ca.DM(hinge.along_on)
-        above = quat_WL[layout.model.table.segments[name].soft_tissue.relative_to]
-        relative = product(ca.vertcat(-above[:3], above[3]), quat_WL[name])
-        part, w = ca.dot(relative[:3], along), relative[3]
-        sine = 2.0 * part * w / ca.fmax(part**2 + w**2, LEAST_TWIST_COSINE)
-        quat_WL[name] = product(quat_WL[name], small_rotation(lag * sine * along))
+        above = quat_WL[layout.model.table.segments[hinge.on].soft_tissue.relative_to]
+        sine = express_twist(above, quat_WL[hinge.on], hinge.along_on)
+        quat_WL[hinge.on] = product(quat_WL[hinge.on], small_rotation(lag * sine * ca.DM(hinge.along_on)))
     return quat_WL
 
 
@@ -254,11 +256,13 @@ def build_prior(
         information[foam, foam] = np.maximum(np.tile(table.segments[name].foam_std, 3), LEAST_FOAM_STD) ** -2.0
     for hinge, twist in zip(layout.twists, layout.twist, strict=True):
         information[twist, twist] = table.segments[hinge.on].soft_tissue.per_twist ** -2.0
+    for name, c in zip(layout.carried, layout.carrying, strict=True):
+        mean[c], information[c, c] = table.hinges[name].per_twist_mean, table.hinges[name].per_twist_std ** -2.0
     # Axes of hinges; those of a left and a right one are partly alike.
     hinges = {hinge.name: rows for hinge, rows in zip(layout.hinges, layout.hinge, strict=True)}
     for name, (across, tilted) in hinges.items():
         own, other = table.hinges[name], table.counterpart(name)
-        information[tilted, tilted] = own.tilt_std**-2
+        mean[tilted], information[tilted, tilted] = own.tilt_mean, own.tilt_std**-2
         if other not in hinges:
             information[across, across] = 1.0 / (own.common_std**2 + own.mirror_std**2)
         elif table.side(name) == "left":

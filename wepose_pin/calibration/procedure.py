@@ -60,6 +60,7 @@ WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degr
 MOST_LAG_STD = 0.15  # [rad/rad] from which on the motion does not show how far a sensor lags behind a twist
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
 BETTER = 0.6  # times the doubt of the stated labels, below which another labelling is the true one
+MOST_OPEN = 0.3  # of a closure's samples, with that other labelling
 
 Alternative = Callable[[CalibrationProblem], CalibrationProblem]  # with other labels, or without some mounts
 
@@ -211,11 +212,14 @@ def solve_plausible(problem: CalibrationProblem) -> Calibration:
     problem = problem.leave_out_mounts()
     problem.observe()  # raises where a phase is too short
     best = stated = solve_problem(problem, quick=True)
-    for list_alternatives, better in ((list_mount_alternatives, np.inf), (list_label_alternatives, BETTER)):
+    for list_alternatives, better, open_share in (
+        (list_mount_alternatives, np.inf, 1.0),
+        (list_label_alternatives, BETTER, MOST_OPEN),
+    ):
         stated = best
         limit = min(1.0, better * measure_doubt(stated)[0])
         tried = [solve_problem(change(stated.problem), quick=True) for change in list_alternatives(stated)]
-        doubts = [measure_doubt(each)[0] for each in tried]
+        doubts = [measure_doubt(each)[0] if each.open_share <= open_share else np.inf for each in tried]
         if min(doubts, default=np.inf) < limit:
             best = tried[int(np.argmin(doubts))]
     if best.problem.exchanged:
@@ -365,13 +369,14 @@ def _estimate_hinges(fit: LeastSquares, x_cov: np.ndarray) -> tuple[dict[str, Hi
     spans = [span for c, span in fit.spans if isinstance(c, Closure | FreeMotion)]
     twists = zip(layout.twists, layout.twist, strict=True)
     lags = {hinge.on: float(fit.x[row]) for hinge, row in twists if x_cov[row, row] < MOST_LAG_STD**2}
+    carrying = dict(zip(layout.carried, fit.x[layout.carrying].tolist(), strict=True))
     for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
         if spans:
             axis = np.array(term.axis) + across * term.across + tilted * term.tilted
             axis_L = layout.start_pose.rotation(term.on).T @ axis / np.linalg.norm(axis)
             bending = np.concatenate([fit.residuals[span, GAP_ROWS + k] for span in spans])
             hinge_rms[term.name] = rms = float(HINGE_STD * np.sqrt(np.mean(bending**2)))
-            hinges[term.name] = Hinge(axis_L, rms, lags.get(term.on))
+            hinges[term.name] = Hinge(axis_L, rms, lags.get(term.on), carrying.get(term.name))
     return hinges, hinge_rms
 
 

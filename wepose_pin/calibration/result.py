@@ -48,6 +48,7 @@ LEAST_ROTATION = np.deg2rad(8.0)
 # [m] rms while the palms touch: wrists bend, shoulders travel. Careful simulated people have 39 mm, give or take 5, and
 # those with more are no farther off.
 GAP = 0.055, 0.075
+APART = 0.15  # [m] rms of the gap, from which on nothing was joined
 OPEN_SHARE = 0.10, 0.60  # share of samples
 # [rad] of a segment in the start pose: forearms hang 13 deg outwards and 12 deg forwards, give or take 5 and 7
 # (docs/people.md): 18 deg off in all, give or take 6.
@@ -142,6 +143,11 @@ class Calibration:
         return self.closed & (self.contact > MIN_CONTACT)
 
     @property
+    def open_share(self) -> float:
+        """The share of a closure's samples at which the palms were apart; 0 without a closure."""
+        return float(np.mean(self.contact[self.closed] < MIN_CONTACT)) if self.closed.any() else 0.0
+
+    @property
     def open_intervals(self) -> list[tuple[float, float]]:
         """Intervals [s] in which the palms were apart."""
         runs = find_runs(self.closed & (self.contact < MIN_CONTACT))
@@ -191,6 +197,9 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     if rotation < LEAST_ROTATION and any(check.quality == "fail" for check in checks):
         # All that fails follows from it.
         checks = [_check("motion-too-small", rotation, ROTATION, facts={"variant": "soft-tissue"}, quality="fail")]
+    if calibration.rms_gap > APART and not calibration.exchanged:
+        still = [check for check in checks if check.diagnostic.code == "motion-too-small"]
+        checks = [_check("closure-gap-large", calibration.rms_gap, GAP, facts={"variant": "apart"}), *still]
     # What does not pass, the worst first; the cause of several once.
     failing = [check for check in checks if check.quality != "pass"]
     failing.sort(key=lambda check: (check.quality != "fail", -check.excess))
@@ -272,10 +281,15 @@ def _check_results(calibration: Calibration, rotations: Mapping[str, float]) -> 
             std, cause = subject.std(f"mounts.{segment}.z"), _find_cause(calibration, rotations, spine)
             yield _check("mount-heading-uncertain", std, limits, segment, cause=cause)
     if problem.protocol.closures:
-        share = float(np.mean(calibration.contact[calibration.closed] < MIN_CONTACT))
         yield _check("closure-gap-large", calibration.rms_gap, GAP)
         yield _check("motion-too-small", calibration.effective_sample_size, SAMPLES)
-        yield _check("closure-open", share, OPEN_SHARE, "", {"intervals": format_longest(calibration.open_intervals)})
+        yield _check(
+            "closure-open",
+            calibration.open_share,
+            OPEN_SHARE,
+            "",
+            {"intervals": format_longest(calibration.open_intervals)},
+        )
     tilts = {name: float(np.linalg.norm(own[:2])) for name, own in subject.start_pose_offset.items()}
     if tilts:
         name = max(tilts, key=tilts.__getitem__)

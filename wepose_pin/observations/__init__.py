@@ -38,6 +38,7 @@ from ..body import BodyModel
 from ..body.girdle import PARAMETERS, make_law
 from ..body.kinematics import find_carrier
 from ..body.mounts import StartPose
+from ..body.soft_tissue import LEAST_TWIST_COSINE
 from ..body.table import HingeJoint
 from ..body.tree import UNIVERSE
 from ..errors import BadSession
@@ -265,14 +266,23 @@ def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: 
 # Hinges ---------------------------------------------------------------------------------------------------------------
 
 
-def express_deviation(hinge: HingeJoint, quat_on: ca.SX, quat_moves: ca.SX, error: ca.SX) -> ca.SX:
-    """Return the sine of the angle by which `moves` leaves the hinge's plane; the axis is off by `error` (2,) [rad].
+def express_deviation(
+    hinge: HingeJoint, quat_on: ca.SX, quat_moves: ca.SX, error: ca.SX, per_twist: ca.SX | float
+) -> ca.SX:
+    """Return the sine of the angle by which `moves` leaves the hinge's plane, beyond `per_twist` of its own twist.
 
-    The error is along `across` and `tilted`.
+    The axis is off by `error` (2,) [rad] along `across` and `tilted`.
     """
     along = rotate_back(quat_on, rotate(quat_moves, hinge.along))
     axis = ca.DM(hinge.axis) + ca.horzcat(ca.DM(hinge.across), ca.DM(hinge.tilted)) @ error
-    return ca.dot(axis, along) / ca.norm_2(axis)
+    return ca.dot(axis, along) / ca.norm_2(axis) - per_twist * express_twist(quat_on, quat_moves, hinge.along)
+
+
+def express_twist(quat_on: ca.SX, quat_moves: ca.SX, along: Sequence[float]) -> ca.SX:
+    """Return the sine of the twist of `moves` against `on` about its long axis `along` (3,)."""
+    relative = product(ca.vertcat(-quat_on[:3], quat_on[3]), quat_moves)
+    part, w = ca.dot(relative[:3], ca.DM(along)), relative[3]
+    return 2.0 * part * w / ca.fmax(part**2 + w**2, LEAST_TWIST_COSINE)
 
 
 def linearize_hinge(
@@ -297,7 +307,7 @@ def _linearization(hinge: HingeJoint) -> ca.Function:
     on, moves = ca.SX.sym("on", 4), ca.SX.sym("moves", 4)
     headings, error = ca.SX.sym("headings", 2), ca.SX.sym("error", 2)
     quat_on, quat_moves = product(about_z(headings[1]), on), product(about_z(headings[0]), moves)
-    r = express_deviation(hinge, quat_on, quat_moves, error)
+    r = express_deviation(hinge, quat_on, quat_moves, error, hinge.per_twist)
     H = ca.jacobian(r, ca.vertcat(headings, error))
     r, H = ca.substitute([r, H], [error], [ca.DM.zeros(2)])
     along = rotate_back(quat_on, rotate(quat_moves, hinge.along))

@@ -162,7 +162,8 @@ class HeadingFilter:
         calibrated = {} if first.remounted else subject.hinges
         for hinge in find_hinges(model, start_pose, self.names):
             if (own := calibrated.get(hinge.name)) is not None:
-                hinges.append((hinge._replace(axis=start_pose.turn(hinge.on, own.axis)), AXIS_STD, TILT_STD, own.std))
+                hinge = hinge._replace(axis=start_pose.turn(hinge.on, own.axis), per_twist=own.per_twist or 0.0)
+                hinges.append((hinge, AXIS_STD, TILT_STD, own.std))
             elif not kind:
                 axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
                 hinges.append((hinge, axis_std, hinge.tilt_std, hinge.softness))
