@@ -300,10 +300,10 @@ def test_a_recording_of_arrays_is_that_of_the_session(simulated: Simulation) -> 
     for wrong, said in (
         ({"rate_hz": 0.0, "torso": quat}, "rate_hz = 0.0; a finite number above 0 is needed"),
         ({"rate_hz": 50.0}, "no sensors"),
-        ({"rate_hz": 50.0, "torso": (quat,)}, "torso: gyro_S and accel_S, "),
+        ({"rate_hz": 50.0, "torso": (quat, quat)}, "torso: the arrays gyro_S and accel_S, "),
         ({"rate_hz": 50.0, "torso": quat, "mounts": {"torso": ("z", "+x")}}, "mounts: torso.up = 'z' is not known"),
         ({"rate_hz": 50.0, "torso": quat, "mounts": {"torso": "+z"}}, "mounts.torso = '+z'; a list of 2 texts"),
-        ({"rate_hz": 50.0, "torso": (5, 5)}, "sensors.torso.gyro_S = 5; an array is needed"),
+        ({"rate_hz": 50.0, "torso": (5, 5)}, "or quat_VS, (n, 4), are needed, not int and int"),
         ({"rate_hz": 50.0, "torso": quat, "left_arm": quat}, "sensors.left_arm is no segment"),
     ):
         with pytest.raises(wp.WeposeError, match=re.escape(said)):

@@ -116,7 +116,7 @@ def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulati
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({}, "needs one measured length that fixes the scale, as in --measured biacromial=0.41; there is: shoul"),
+        ({}, "needs one measured length that fixes the scale, as in `measured` biacromial=0.41; there is: shoul"),
         ({"measured": {"trunk": 0.5, "left_hand": 0.07}}, "needs one measured length that fixes the scale"),
         ({"measured": {"shoulder_width": 0.4}, "protocol": "table"}, "points of the body coincide .* not 'table'"),
         ({"measured": {"shoulder_width": 0.4}, "protocol": "t_pose"}, "points of the body coincide .* not 't_pose'"),
@@ -134,7 +134,7 @@ def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[P
 
 def test_another_start_pose_is_refused(made: tuple[Person, Simulation, Recording]) -> None:
     """Its orientations are relative to the start pose: in the T-pose they would be those of other arms."""
-    expected = "start_pose = 't_pose'; record a start in n_pose, or use --formulation full"
+    expected = "start_pose = 't_pose'; record a start in n_pose, or use `formulation` full"
     with pytest.raises(WeposeError, match=expected):
         calibrate(replace(made[2], start_pose="t_pose"), measured={"shoulder_width": 0.4}, formulation="paper")
 
