@@ -241,7 +241,7 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
     swing = np.sin(np.arange(900) / 50.0)[:, None]
     beyond = ((1e200 * gyro, accel), r"^gyro_S .* rad/s"), ((gyro, 1e3 * accel), r"^accel_S .* m/s\^2")
     deg_s, moving = gyro + 20.0 * swing, gyro + swing * [0.0, 0.0, 1.0]
-    for wrong, match in (*beyond, ((deg_s, accel), "are the rates in deg/s"), ((moving, accel), r"turns at 4\d deg/s")):
+    for wrong, match in (*beyond, ((deg_s, accel), "rad/s are needed"), ((moving, accel), r"turns at 4\d deg/s")):
         with pytest.raises(WeposeError, match=match):
             wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
 

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,11 +17,11 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..arguments import Positive, check_arguments, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
-from ..errors import BadData, BadOption, BadPhase, WeposeWarning, WrongUnit, one_of
+from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.faults import check_arrays, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
-from ..recording.plausibility import SHORTEST_WINDOW_S, check_gyro
+from ..recording.plausibility import is_in_degrees
 from .amekf import AMEKF
 from .amekf import AmekfParams as AmekfParams
 from .base import Orientation as Orientation
@@ -300,19 +299,15 @@ def estimate_orientation(
             )
     check_arrays("", rate_hz, {"": (gyro, accel)})
     sensor = ImuSensor(gyro, accel, gyro_range=find_gyro_range(gyro, accel))
-    # Seconds about the fastest motion show a wrong unit; a check of all samples takes as long as a filter.
-    fastest, size = int(gyro.argmax()) // 3, math.ceil(SHORTEST_WINDOW_S * rate_hz)
-    begin = max(0, min(fastest - size, len(gyro) - 2 * size))
-    part = sensor.part(slice(begin, begin + 2 * size))
-    try:
-        diagnostics = tuple(check_gyro("", part, rate_hz, "sensor"))
-    except WrongUnit as error:
-        raise BadData(f"{error.finding}; are the rates in {error.unit}, or is rate_hz wrong?") from None
-    noise, start = TYPICAL, None
+    if is_in_degrees(gyro, accel, rate_hz):
+        raise BadData(
+            "gyro_S: gravity would tumble by these rates, and accel_S shows that it does not; rad/s are needed"
+        )
+    noise, start, diagnostics = TYPICAL, None, tuple[Diagnostic, ...]()
     if static is None:
         facts = {"method": method} | ({"variant": "estimated"} if method in ("amekf", "smoother") else {})
-        diagnostics += (Diagnostic("static-phase-missing", WARNING, facts=facts),)
-        warnings.warn(join_text(render(diagnostics[-1])), WeposeWarning, stacklevel=2)
+        diagnostics = (Diagnostic("static-phase-missing", WARNING, facts=facts),)
+        warnings.warn(join_text(render(diagnostics[0])), WeposeWarning, stacklevel=2)
     else:
         first, last = np.round(np.multiply(static, rate_hz)) + (0.0, 1.0)
         if not 0.0 <= first < last <= len(gyro) + 1:

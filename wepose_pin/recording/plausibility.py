@@ -6,6 +6,7 @@ rotated by the gyroscope, averages to gravity over seconds, since speed is bound
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from itertools import permutations
 
@@ -57,7 +58,7 @@ def check_signals(
     for segment, sensor in imus.items():
         place, gyro_S, accel_S = f"{where}: sensors.{segment}", sensor.gyro_S, sensor.accel_S
         diagnostics += _check_gravity(time, rate_hz, phases, segment, sensor, place)
-        diagnostics += check_gyro(segment, sensor, rate_hz, place)
+        diagnostics += _check_gyro(segment, sensor, rate_hz, place)
         for name, values, most, unit, saturated in (
             ("gyro", gyro_S, HIGHEST_RATE, "rad/s", np.abs(gyro_S) >= sensor.gyro_range),
             ("accel", accel_S, HIGHEST_ACCEL, "m/s^2", find_saturation(accel_S, NARROWEST_ACCEL_RANGE)),
@@ -117,7 +118,7 @@ def _check_gravity(
     return [Diagnostic("accel-scale", WARNING, segment, share, GRAVITY_ERROR_NOTED, facts)]
 
 
-def check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> list[Diagnostic]:
+def _check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> list[Diagnostic]:
     """Compare the rates with the motion of gravity: `WrongUnit`, or a diagnostic of other axes, signs or scale."""
     size = min(round(WINDOW_S * rate_hz), len(sensor.gyro_S) // FEWEST_WINDOWS)
     if size < SHORTEST_WINDOW_S * rate_hz:
@@ -131,15 +132,11 @@ def check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> l
     motion = np.linalg.norm(gyro, axis=2).mean(axis=1) + np.linalg.norm(accel.std(axis=1), axis=1) / STANDARD_GRAVITY
     moving = np.argsort(-motion, kind="stable")[:WINDOWS]
 
-    def average_coherence(change: np.ndarray) -> float:
-        """0 to 1; the specific force of a swinging arm is several times gravity, its mean in the world is gravity."""
-        means = _average_force(gyro[moving] @ change.T / rate_hz, accel[moving])
-        return float(np.mean(np.maximum(0.0, 1.0 - np.abs(means / STANDARD_GRAVITY - 1.0))))
-
-    stated = average_coherence(np.eye(3))
+    turns, accel = gyro[moving] / rate_hz, accel[moving]
+    stated = _average_coherence(turns, accel)
     if not stated < STIFF:  # coherence is at most 1: above it no other unit is better; NaN: beyond any range
         return []
-    coherences = {name: average_coherence(change) for name, change in GYRO_CHANGES.items()}
+    coherences = {name: _average_coherence(turns @ change.T, accel) for name, change in GYRO_CHANGES.items()}
     best = max(coherences.values())
     change = next(name for name, coherence in coherences.items() if coherence > best - SIMILAR)
     peak, hint = float(np.max(np.abs(sensor.gyro_S))), ", or the time or rate_hz is wrong"
@@ -155,6 +152,24 @@ def check_gyro(segment: str, sensor: ImuSensor, rate_hz: float, place: str) -> l
     return [Diagnostic("gyro-contradicted", WARNING, segment, stated, CONTRADICTED * best, {"rates": change})]
 
 
+def is_in_degrees(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> bool:
+    """Whether the rates (n, 3) are in deg/s in place of rad/s, by the seconds about the fastest motion.
+
+    `accel_S` (n, 3) is in m/s². A check of all seconds takes as long as a filter.
+    """
+    size, fastest = math.ceil(SHORTEST_WINDOW_S * rate_hz), int(gyro_S.argmax()) // 3
+    if len(gyro_S) < FEWEST_WINDOWS * size:
+        return False
+    begin = min(max(0, fastest - size), len(gyro_S) - FEWEST_WINDOWS * size)
+    part = slice(begin, begin + FEWEST_WINDOWS * size)
+    turns, accel = gyro_S[part].reshape(-1, size, 3) / rate_hz, accel_S[part].reshape(-1, size, 3)
+    stated = _average_coherence(turns, accel)
+    if not stated < TUMBLES:  # coherence is at most 1
+        return False
+    smaller = _average_coherence(np.deg2rad(turns), accel)
+    return smaller > COHERENT and stated < TUMBLES * smaller
+
+
 def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
     """Find the largest rate [rad/s] of a sensor whose gyroscope turns gravity and whose accelerometer does not, or NaN.
 
@@ -164,6 +179,12 @@ def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) ->
     steady, turned = (_average_force(scale * turns, accel_S[None])[0] for scale in (0.0, 1.0))
     is_unseen = steady > STEADY * force and turned < UNTURNED * steady
     return float(np.linalg.norm(gyro_S, axis=1).max()) if is_unseen else np.nan
+
+
+def _average_coherence(turns: np.ndarray, accel_S: np.ndarray) -> float:
+    """0 to 1; the specific force of a swinging arm is several times gravity, its mean in the world is gravity."""
+    means = _average_force(turns, accel_S)
+    return float(np.mean(np.maximum(0.0, 1.0 - np.abs(means / STANDARD_GRAVITY - 1.0))))
 
 
 def _average_force(turns: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
