@@ -102,7 +102,6 @@ def test_the_covariance_is_right(method: str, seeds: int) -> None:
             align_heading(Rotation.from_quat(result.quat_VS), of.true, np.array([50]))[k].inv() * of.true[k]
         ).as_rotvec()
         values.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(result.attitude_cov[k]), error)))
-    print(f"{method}: NEES {np.mean(values):.2f} of 3, sd of the mean {np.std(values) / seeds**0.5:.2f}")
     assert abs(np.mean(values) - 3.0) < (0.9 if seeds > 20 else 1.5)
 
 
@@ -119,7 +118,6 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
             error = errors(of, run(wrong, params=AmekfParams(gyro_matrix_std=std)).quat_VS)
             off[-1].append(np.abs(heading_deg(error[end])).mean())
     learned_deg, fixed_deg = np.mean(off, axis=0)
-    print(f"heading in the last 10 s: scale learned {learned_deg:.2f} deg, not learned {fixed_deg:.2f} deg")
     assert learned_deg < 0.6 * fixed_deg
 
 
@@ -183,7 +181,6 @@ def test_a_sensor_that_never_rests_converges_and_says_so(method: str) -> None:
         tilts.append(tilt_deg(Rotation.from_quat(orientation.quat_VS) * of.true.inv()))
         assert not orientation.static.any()
     by = np.mean(tilts, axis=0)
-    print(f"{method}: tilt at the start {by[0]:.1f}, after 10 s {by[1000]:.2f}, at the end {by[-500:].mean():.2f} deg")
     assert by[0] > 3.0 or method == "smoother"
     assert by[1500:].max() < 1.5
     assert by[-500:].mean() < 0.6
@@ -226,9 +223,6 @@ def test_broad_against_vqf(method: str, data: Path) -> None:
         error = align_heading(Rotation.from_quat(out.quat_VS), true, rest)[scored] * true[scored].inv()
         rows.append(np.degrees([rms(np.deg2rad(tilt_deg(error))), rms(error.magnitude())]))
     everywhere, held = np.mean(rows, axis=0), np.mean(rows[1::2], axis=0)
-    print(
-        f"{len(paths)} trials, RMSE [deg] of inclination and total: {method} {everywhere.round(2)}, VQF {VQF[method]}"
-    )
     assert everywhere[0] <= VQF[method][0]
     assert everywhere[1] <= 0.9 * VQF[method][1]
     assert held[1] <= VQF[method][1]

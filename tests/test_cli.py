@@ -96,7 +96,7 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
     options = ("--measured", "shoulder_width=0.35", "--stature", 1.67, "--no-report")
     assert run("calibrate", session, *options, "-o", tmp_path / "subject") == 0
     printed = capsys.readouterr().out
-    assert "Palm to palm, root mean square while touching" in printed
+    assert "Palm to palm, root mean square of the samples used" in printed
     assert "Quality: pass" in printed
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result", "--no-report") == 0
     assert re.search("amekf, lengths: hands together.*Good for elbow flexion to ±", capsys.readouterr().out, re.DOTALL)

@@ -127,7 +127,6 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
             error = np.unwrap(off.as_euler("ZYX", degrees=True)[:, 0], period=360.0)
             errors.append(float(np.abs(error - error[100]).max()))
     mean = {method: float(np.mean(errors)) for method, errors in worst.items()}
-    print(f"largest heading error [deg], mean of 8: {mean}")
     assert mean["smekf"] < 0.7
     assert mean["smekf"] < 0.6 * mean["smekf_published"]
 
@@ -192,7 +191,6 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
         assert len(orientation.static) == len(gyro)
         assert orientation.static[4900:].mean() > 0.8
         worst.append(float(tilt_deg.max()))
-    print(f"{method}: tilt within {np.round(worst, 2)} deg")
     if orientation.attitude_cov is not None:  # what the others keep depends on their gains
         assert max(worst) < 1.0
 
@@ -245,5 +243,4 @@ def test_the_authors_own_trial_against_vicon(data: Any) -> None:
         R_VS = Rotation.from_quat(out.quat_VS[trial.scored])
         aligned = (true[0] * R_VS[0].inv()) * R_VS
         angle = np.degrees((true.inv() * aligned).magnitude())
-        print(f"{method}: mean angle {angle.mean():.3f} deg, largest {angle.max():.2f} deg")
         assert angle.mean() < limit

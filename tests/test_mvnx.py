@@ -100,7 +100,6 @@ def test_elbow_and_wrist_have_the_joint_angles_of_xsens(
         x, y, z = theirs[:, labels.index(f"j{name}{joint.capitalize()}")].T
         turn = Rotation.from_euler("ZXY", np.column_stack([z, -x, y]), degrees=True)
         off = (turn.inv() * Rotation.from_quat(angles[f"{side}_{joint}"].quat)).magnitude()
-        print(f"{side} {joint}: {np.degrees(off.max()):.5f} deg at most")
         assert np.degrees(off.max()) < 0.001
     if side == "right":  # the left elbow goes through gimbal lock
         np.testing.assert_allclose(np.degrees(angles["right_wrist"].values), np.column_stack([z, -x, y]), atol=0.001)

@@ -115,7 +115,6 @@ def test_a_rotation_too_slow_to_tell_from_the_bias_is_in_the_standard_deviation(
         error = Rotation.from_quat(tracked.quat_WL["torso"]) * R.inv()
         std = np.sqrt(tracked.pose.segment_cov["torso"][-1, 2, 2])
         worst = max(worst, abs((error[-1] * error[:500].mean().inv()).as_rotvec()[2]) / std)
-    print(f"{method}, sway {sway} deg/s: heading off by up to {worst:.1f} standard deviations")
     assert worst < 6.0
 
 
@@ -165,7 +164,6 @@ def test_a_worn_sensor_s_bias_is_as_uncertain_as_sway_makes_it(seconds: float) -
         gyro = sway + rng.normal(scale=np.deg2rad(0.07), size=(len(time), 3))
         noise = estimate_noise(gyro, np.tile([0.0, 0.0, 9.8], (len(time), 1)), RATE, worn=True)
         z += list(noise.gyro_bias / np.sqrt(np.diag(noise.gyro_bias_cov)))
-    print(f"{seconds} s: rms {np.sqrt(np.mean(np.square(z))):.2f}, largest {np.abs(z).max():.1f} standard deviations")
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3
     assert np.abs(z).max() < 5.0
 

@@ -75,7 +75,7 @@ def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
     assert subject.mounts == {}
 
 
-HINGE = "x = 0.0\ny = 0.5\nz = 0.0\nstd_deg = 2.0\ntwist_lag = 0.0"
+HINGE = "x = 0.0\ny = 0.5\nz = 0.0\nstd_deg = 2.0\ntwist_lag = 0.0\nper_twist = -0.1"
 GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 0"  # without raised_z
 
 

@@ -124,7 +124,6 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
         up_said = R_LS.apply(accel_S[standing]).mean(axis=0)
         up_found = Rotation.from_quat(pose.quat_WL[segment][standing]).mean().as_matrix()[2]
         off = np.degrees(np.arccos(up_found @ up_said / np.linalg.norm(up_said)))
-        print(f"{segment}: tilt {off:.2f} deg off what the accelerometer says")
         assert off < 4.0
     # In the N-pose all is where it should be: arms down, facing forward.
     start = recording.span((40.2, 44.4))

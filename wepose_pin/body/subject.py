@@ -27,8 +27,8 @@ BodyLength = Annotated[float, Range(0.0, closed=False, high=LONGEST, unit="m")]
 FORMAT = 2
 Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
-# [rad] by which the plane of a hinge is rotated about the segment above it against that segment's frame; assumption, of
-# simulated people, whose forearms bend aside as they turn.
+# [rad] by which the plane of a hinge is turned about the segment above it against that segment's frame, beyond its
+# turn in the start pose; of simulated people.
 HINGE_PLANE_STD = np.deg2rad(7.0)
 MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person has
 

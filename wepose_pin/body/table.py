@@ -114,14 +114,15 @@ class HingeJoint(NamedTuple):
     # Of the axis's rotation about the long axis of `on`: the part that is equal, and opposite, on both sides.
     common_std: Angle = float(np.deg2rad(6.5))
     mirror_std: Angle = float(np.deg2rad(20.0))
-    tilt_mean: Annotated[float, Key(unit="deg")] = 0.0  # the same, along `tilted`; a mean counts in a calibration only
-    tilt_std: Angle = float(np.deg2rad(5.0))  # of the axis's rotation about the direction across both
+    # Of the axis's rotation about the direction across both; means count in a calibration only.
+    tilt_mean: Annotated[float, Key(unit="deg")] = 0.0
+    tilt_std: Angle = float(np.deg2rad(5.0))
     # [rad/rad] by which `moves` leaves the plane, towards the axis, as it turns about its long axis.
     per_twist_mean: float = 0.0
     per_twist_std: Annotated[float, Key(least=0.0)] = 0.0
     # Of hinges between sensors:
     name: Annotated[str, None] = ""  # of the joint
-    per_twist: Annotated[float, None] = 0.0  # as a calibration found it
+    per_twist: Annotated[float, None] = 0.0  # [rad/rad] of the person, as calibrated
     along_on: Annotated[Vector, None] = ZERO  # the long axis of `on`
     along: Annotated[Vector, None] = ZERO  # the long axis of `moves`, in its own frame
 

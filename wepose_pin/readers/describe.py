@@ -197,7 +197,9 @@ def _list_facts(recording: Recording) -> list[str]:
     facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {format_span(recording.time[[0, -1]])}"]
     static = _find_static_intervals(recording)
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in static[:8]) + (" …" if len(static) > 8 else "")
-    facts.append(f"all sensors static [s]: {listed}" if static else "in no second all sensors are static")
+    facts.append(
+        f"all sensors static [s]: {listed}" if static else "there is no second in which all sensors are static"
+    )
     for name, spans in recording.phases.items():
         listed = ", ".join(f"{format_time(a)} to {format_time(b)}" for a, b in spans)
         facts.append(f"phase {name} [s]: {listed or 'none'}")

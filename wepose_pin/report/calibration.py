@@ -151,7 +151,7 @@ def _list_sensors(calibration: Calibration) -> list[Item]:
 def describe_gap(calibration: Calibration) -> str:
     """The gap before and after, and how much the motion tells."""
     return (
-        f"{_name_gap(calibration)}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm "
+        f"{_name_gap(calibration)}, root mean square of the samples used: {1e3 * calibration.prior_rms_gap:.1f} mm "
         f"before, {1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
         f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
     )
