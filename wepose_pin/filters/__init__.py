@@ -262,7 +262,7 @@ def estimate_orientation(
     ------
     BadOption, BadData, BadPhase
         An unknown method; arrays that do not fit each other; samples that are not finite, frozen or otherwise no
-        measurement; a static phase outside the data.
+        measurement; rates in deg/s; a static phase outside the data, with motion, or without gravity in m/s².
 
     Warns
     -----
