@@ -21,7 +21,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import expit, logit
 
 from .. import rotations
 from ..body import BodyModel
@@ -63,12 +62,8 @@ LEAP_RATIO, GROWTH_MEMORY_S = 10.0, 60.0
 # states: its motions are not as random as it assumes. Found by simulated people who walk, run, throw and reach.
 LEAST_LEARNED, LEARNED_VARIANCE_RATIO = 1e-4, 4.0
 MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accelerations
-# People stand off the start pose as the population does, or by a share of it where they take care: the share, and how
-# likely that is before anything is observed; assumptions.
-CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.05
-# Share of the variance of a pelvis', leg's or head's heading that is by the torso's turn: 4 of 5° (docs/people.md). The
-# arms do not show it: a careful person has half of that turn, by which a person differs between two start poses.
-TURN_VAR_SHARE, CAREFUL_TURN_SHARE = (4.0 / 5.0) ** 2, 0.5
+# Share of the variance of a pelvis', leg's or head's heading that is by the torso's turn: 4 of 5° (docs/people.md).
+TURN_VAR_SHARE = (4.0 / 5.0) ** 2
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
@@ -202,9 +197,8 @@ class HeadingFilter:
         # Since W's x is where the torso faces, its turn is an error of all headings that it does not carry with it.
         carried = [bool(kind) or model.find_trunk(name) in (None, model.table.reference) for name in self.names]
         shares = TURN_VAR_SHARE * np.outer(np.logical_not(carried), np.logical_not(carried))
-        by_turn = [shares * np.minimum.outer(var, var) for var in start_vars]
-        apart = [np.diag(var - np.diag(cov)) for var, cov in zip(start_vars, by_turn, strict=True)]
-        self.start_cov, self._again_cov = np.add(apart, by_turn)
+        np.fill_diagonal(shares, 1.0)
+        self.start_cov, self._again_cov = (shares * np.minimum.outer(var, var) for var in start_vars)
         # (k, k) [rad²]; a calibration knows the headings of mounts against each other better than that of each.
         self.mount_cov = LEAST_MOUNT_VAR * np.eye(k)
         if not first.remounted:
@@ -226,7 +220,6 @@ class HeadingFilter:
             "mount": (np.zeros(k), always),  # [rad] of a mount's heading
             "force": (force_std, FORCE_CORRELATION_S),  # [m/s²] fixed in the sensor's frame
             "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
-            "start": (np.zeros(k), always),  # [rad] of the segment's heading in the start pose
             "lever": (np.tile(lever_std[:, None], 6), always),  # [m] of the near and the far sensor from the joint
         }
         ends = np.cumsum([std.size for std, _ in states.values()])
@@ -251,10 +244,6 @@ class HeadingFilter:
             for i, hinge in enumerate(self.hinges)
         ]
         self._shape_cov = subject.shape_covariance(model.table)
-        # What care adds to the information (k, k) [1/rad²] of the start pose, and by how much it shrinks its volume.
-        careful = np.linalg.inv(CAREFUL_SHARE**2 * apart[0] + CAREFUL_TURN_SHARE**2 * by_turn[0])
-        self._care_information = careful - np.linalg.inv(self.start_cov)
-        self._care_log_det = np.linalg.slogdet(careful @ self.start_cov)[1]
         self.reset(np.zeros(k))
         # Recent misfit e of each joint's accelerations, with its force f: sums of e fᵀ (9), e² (3) and f² (3) [m²/s⁴]
         # over samples, in which older ones count less, and how many count.
@@ -278,19 +267,11 @@ class HeadingFilter:
         `again`: it is another start pose than that of the calibration, whatever the first one was.
         """
         self.start_cov = self._again_cov if again else self.start_cov
-        P, start_cov, mount_cov = self.P, self.start_cov, self.mount_cov
-        heading, mount, start = (self._columns[name] for name in ("heading", "mount", "start"))
-        self.x[heading], self.x[start] = headings, 0.0
-        for columns in (heading, mount, start):
-            P[columns, :], P[:, columns] = 0.0, 0.0
-        columns, none = np.concatenate([heading, mount, start]), np.zeros(mount_cov.shape)
-        P[np.ix_(columns, columns)] = np.block(
-            [
-                [start_cov + mount_cov, -mount_cov, start_cov],
-                [-mount_cov, mount_cov, none],
-                [start_cov, none, start_cov],
-            ]
-        )
+        heading, mount = self._columns["heading"], self._columns["mount"]
+        self.x[heading], both = headings, np.concatenate([heading, mount])
+        self.P[both, :], self.P[:, both] = 0.0, 0.0
+        cov = [[self.start_cov + self.mount_cov, -self.mount_cov], [-self.mount_cov, self.mount_cov]]
+        self.P[np.ix_(both, both)] = np.block(cov)
         self._searched = np.zeros(len(headings), dtype=bool)
 
     def step(
@@ -597,38 +578,15 @@ class HeadingFilter:
                 turns |= {(far, near): (turn, limit), (near, far): (-turn, limit)}
         return turns
 
-    def find_care(self, x: np.ndarray, P: np.ndarray) -> float:
-        """Return the probability that the person took care in the start pose, by a state and its covariance.
+    def estimate(self, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return δ (k,) [rad], its covariance (k, k) [rad²], and that of the segments' headings near the start pose.
 
-        The filter's start pose is that of the population. With care, its headings have `CAREFUL_SHARE` of the standard
-        deviation, and the torso's turn `CAREFUL_TURN_SHARE`. The likelihood of that follows in closed form from what
-        the filter knows of the errors s of the start pose, which are states. Only accelerations of joints tell that
-        much. Causally it is 0: in the first minute they do not tell which is right.
+        δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
+        hangs is off by δ + ε_z.
         """
-        if self.causal or not self.pairs:
-            return 0.0
-        columns, information = self._columns["start"], self._care_information
-        s, spread = x[columns], np.eye(len(columns)) + information @ P[np.ix_(columns, columns)]
-        misfit = s @ np.linalg.solve(spread, information @ s)
-        log_ratio = 0.5 * (self._care_log_det - np.linalg.slogdet(spread)[1] - misfit)
-        return float(expit(logit(CAREFUL_PROBABILITY) + log_ratio))
-
-    def estimate(self, x: np.ndarray, P: np.ndarray, care: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the mean of δ (k,) [rad] over both start poses, with care of this probability and without.
-
-        Then its covariance (k, k) [rad²], and that of the segments' headings near the start pose: δ begins at s − ε_z,
-        by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that hangs is off by
-        δ + ε_z.
-        """
-        columns, information, k = self._columns["start"], self._care_information, len(self.names)
-        rows, by_start = np.concatenate([self._columns["heading"], self._columns["mount"]]), P[:, columns]
-        spread = np.eye(k) + information @ by_start[columns]
-        gain = by_start[rows] @ np.linalg.solve(spread, information)
-        change = -gain @ x[columns]
-        cov = symmetric(P[np.ix_(rows, rows)] - care * gain @ by_start[rows].T)
-        cov += care * (1.0 - care) * np.outer(change, change)
-        of_headings, both = cov[:k, :k], cov[:k, k:]
-        return (x[rows] + care * change)[:k], of_headings, of_headings + cov[k:, k:] + both + both.T
+        heading, mount = self._columns["heading"], self._columns["mount"]
+        cov, both = P[np.ix_(heading, heading)], P[np.ix_(heading, mount)]
+        return x[heading], cov, cov + P[np.ix_(mount, mount)] + both + both.T
 
 
 def _weigh_joint(misfit: np.ndarray, squares: float, H: np.ndarray, correlated_samples: float) -> float:

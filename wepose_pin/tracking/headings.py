@@ -199,8 +199,7 @@ class HeadingCorrector:
         self._set_variance(self._estimate()[2])
 
     def _estimate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        x, P = self.filter.x, self.filter.P
-        return self.filter.estimate(x, P, self.filter.find_care(x, P))
+        return self.filter.estimate(self.filter.x, self.filter.P)
 
     def _set_variance(self, segment_covariance: np.ndarray) -> None:
         left, correction = self._to - self._from, self._to - self._at_reset  # until it has faded in
@@ -226,8 +225,7 @@ class HeadingCorrector:
         if not self._times:
             return None
         x, P, process = self._read_state(len(self._times) - 1)
-        care = forward.find_care(x, P)
-        estimates = [forward.estimate(x, P, care)]
+        estimates = [forward.estimate(x, P)]
         for knot in range(len(self._times) - 2, -1, -1):
             before_x, before_P, process_before = self._read_state(knot)
             forward.x, forward.P = before_x, before_P
@@ -235,7 +233,7 @@ class HeadingCorrector:
             gain = np.linalg.solve(forward.P, forward.advance(before_P, process[2])).T
             x = before_x + gain @ (x - forward.x)
             P = symmetric(before_P + gain @ (P - forward.P) @ gain.T)
-            estimates.append(forward.estimate(x, P, care))
+            estimates.append(forward.estimate(x, P))
             process = process_before
         smoothed = self.collect(estimates[::-1])
         if measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
