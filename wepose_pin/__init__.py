@@ -19,8 +19,6 @@ Conventions, everywhere:
   (`Pose.segment_cov`) and heading errors δ, θ_W = δ e_z. On the left, in L: `exp(ε_L) R_LS`, mounts.
 """
 
-from __future__ import annotations
-
 import re
 from importlib import import_module
 from pathlib import Path

@@ -5,8 +5,6 @@
 do no checks.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -1,7 +1,5 @@
 """Functions compiled by numba, with bit-identical results for all callers, and cached for the next start."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from functools import partial

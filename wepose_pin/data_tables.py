@@ -4,8 +4,6 @@ A CSV has its columns separated by commas, semicolons or tabs; beside the last t
 before the names and a line of units after them are read too: `read_layout` finds them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

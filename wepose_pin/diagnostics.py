@@ -4,8 +4,6 @@ A room that finds something says it as a `Diagnostic`; `render` makes words of i
 codes stand in ``diagnostics.toml``; ``docs/diagnostics.md`` lists them.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib

@@ -4,8 +4,6 @@ The text names the file, the place in it, the value found and what would be righ
 command line prints it with its options in place of arguments and exits with 2; from Python it is an ordinary exception.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -3,8 +3,6 @@
 Assets are those of the checkout where there is one, else of the wheel. What a package raises becomes one line of ours.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager

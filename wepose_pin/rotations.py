@@ -5,8 +5,6 @@ the per-sample steps of filters and of live tracking: they work on numbers and o
 keep their order of operations, so that results stay bit-identical.
 """
 
-from __future__ import annotations
-
 from functools import reduce
 from math import factorial
 

@@ -1,7 +1,5 @@
 """``wepose batch``: a plan over many recordings."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The plan (``PLAN.toml``): sessions, their subjects, the steps with their options. Places are paths or URLs."""
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import inspect

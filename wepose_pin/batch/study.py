@@ -3,8 +3,6 @@
 The steps of an item run in a new folder, which appears whole or not at all; what is done stays.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import io

@@ -7,8 +7,6 @@ Heavy rooms load inside the functions, so that help and mistakes in options are 
 Ctrl-C and SIGTERM end a command; its output is whole, or there is none.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import io

@@ -1,7 +1,5 @@
 """The command line, by cyclopts: types of options, help in plain lines, and mistakes in one line."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import inspect

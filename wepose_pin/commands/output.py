@@ -1,7 +1,5 @@
 """What the user sees: lines, diagnostics, tables, a progress bar; without the control characters a file may hold."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import textwrap

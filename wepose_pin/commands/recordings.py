@@ -1,7 +1,5 @@
 """The commands that read a recording: ``wepose info``, ``calibrate`` and ``track``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """``wepose retarget``: a person's arms → a robot's joint trajectory."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """``wepose simulate``: a session whose truth is known; ``wepose demo``: the whole chain on one."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from pathlib import Path

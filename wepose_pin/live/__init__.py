@@ -3,8 +3,6 @@
 Outputs load when they are used: `page` for the browser, `terminal`, `outputs` for other programs and robots.
 """
 
-from __future__ import annotations
-
 from .loop import LiveLoop as LiveLoop
 from .loop import SessionSummary as SessionSummary
 from .loop import run_session as run_session

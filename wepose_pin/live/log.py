@@ -1,7 +1,5 @@
 """The recording of a live session, written as it comes (format: `readers.live_log`)."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """A live session: samples of a source → ticks → poses → outputs and the recording."""
 
-from __future__ import annotations
-
 import gc
 import itertools
 import math

@@ -3,8 +3,6 @@
 See docs/live-outputs.md. A robot gets commands at a constant rate, JSON over UDP.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import socket

@@ -1,7 +1,5 @@
 """`Stage` and `Output` of a live session, and what they tell each other: poses, the state, what may be asked for."""
 
-from __future__ import annotations
-
 import math
 import time
 from abc import ABC, abstractmethod

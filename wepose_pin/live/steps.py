@@ -1,7 +1,5 @@
 """The steps of the guided session: the table, and a generator for each."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future

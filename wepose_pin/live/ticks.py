@@ -1,7 +1,5 @@
 """Samples as they come: rate and unit of each sensor; ticks of one clock; the start pose in the ticks."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence

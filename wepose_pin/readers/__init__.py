@@ -3,8 +3,6 @@
 `formats/` describes tables of devices; `registry` has the formats, and `describe` says what a file is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

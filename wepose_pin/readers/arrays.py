@@ -4,8 +4,6 @@ An array is (n,), (n, k) or (k, n) with n samples; the fields of a MATLAB struct
 MATLAB's v7.3, needs h5py, which is optional.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

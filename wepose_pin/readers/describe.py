@@ -4,8 +4,6 @@ The session is proposed from what files say, and from what names and motion sugg
 marked. Data are described by what it reads.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """What a reader finds in the file of a device: its sensors, in SI, each with its clock."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 ``guess.toml`` has the words.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -8,8 +8,6 @@ pose of tracking, ``reset`` (``tick``) headings anew before that tick; and what 
 ``end`` of a phase (``phase``, ``time``), ``discard`` what was marked of it so far.
 """
 
-from __future__ import annotations
-
 import json
 from array import array
 from collections.abc import Mapping, Sequence

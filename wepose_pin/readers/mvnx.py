@@ -8,8 +8,6 @@ frames of the ISB. The file's frame of type `tpose` tells which; without it the 
 Source: MVN User Manual, MVNX structure; the frames `tpose` and `tpose-isb` of exported files.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Formats here are OpenSim's orientations, ROS bags, XDF and Sensor Logger; `mvnx`
 others.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re

@@ -5,8 +5,6 @@ belong to the names of its columns, which columns are whose gyroscope, accelerom
 the clock.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import re
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ The ticks depend on the samples and their order alone, not on the time of day or
 file with the arrivals therefore gives bit-identical ticks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 

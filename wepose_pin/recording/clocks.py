@@ -5,8 +5,6 @@ bridged: rate and specific force linearly, measured orientations along the short
 or is bridged and marked where the user allows it: filters take no sample in it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

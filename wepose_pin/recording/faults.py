@@ -6,8 +6,6 @@ a single axis that never changes (again) while the sensor moves and the other tw
 Files and live streams (`arrivals`) share what tells noise and saturation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import combinations
 from typing import NamedTuple

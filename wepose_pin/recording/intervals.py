@@ -1,7 +1,5 @@
 """Times and intervals of a recording: their checks, their text, and the selection of one by an option or a phase."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 

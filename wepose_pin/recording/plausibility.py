@@ -4,8 +4,6 @@ The rules are physical and hold for any sensor on any body: a static acceleromet
 rotated by the gyroscope, averages to gravity over seconds, since speed is bounded.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from itertools import permutations

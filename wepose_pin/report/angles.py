@@ -1,7 +1,5 @@
 """The page of `wepose angles`: repetitions, mean curves and tables, as a paper has them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

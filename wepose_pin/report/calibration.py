@@ -1,7 +1,5 @@
 """The report of a calibration: what was estimated, how well it is known, and what of the motion showed it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Figures by matplotlib, as objects: no pyplot, no state that other code could see."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO

@@ -1,7 +1,5 @@
 """Pages: one Jinja2 template, filled section by section; each page is one HTML file that opens offline and prints."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache

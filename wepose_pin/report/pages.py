@@ -1,7 +1,5 @@
 """What a tracked motion is good for, and its pages: beside its result, in a saved folder, and in a notebook."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """The report of a robot's trajectory: the hands and why they are off, the distance of its parts, joint limits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

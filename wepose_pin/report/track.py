@@ -1,7 +1,5 @@
 """The report of a tracked recording: what can be relied on, the recording, headings, hands, joint angles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Words of the reports: names, numbers with their units, lists; and tables, which commands print as pages show them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Self-collision: pairs of shapes that may collide, their distances with Jacobian, whether a way to rest is clear."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple

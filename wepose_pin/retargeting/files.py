@@ -3,8 +3,6 @@
 The checks share no step with the controller: limits are those of URDF and map, shapes those of coal.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, NamedTuple

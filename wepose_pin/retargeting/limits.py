@@ -13,8 +13,6 @@ The bounds of both sides agree where a brake can be released within the joint's 
 (`reduce_acceleration_limits`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..compilation import compiled, inlined, kernel

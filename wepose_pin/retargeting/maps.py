@@ -1,7 +1,5 @@
 """A robot's map (TOML): the links that are shoulder, elbow and hand, its mount, its limits; and those of its URDF."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """`Robot`: a URDF and its map, reduced to the joints of the arms, with their points, limits and collision geometry."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

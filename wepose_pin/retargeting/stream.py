@@ -6,8 +6,6 @@ approach, slows the robot where tracking is poor, and keeps jumps from it. The c
 limits, also while braking. Time is an argument: nothing here reads a clock.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ acceleration and jerk that each joint needs; from these follows a time scaling. 
 motion within the true limits, with the joint path of the first run as posture reference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """How a robot is drawn: triangles for each moving part, few enough for a page, and where its root is in W."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 from xml.etree import ElementTree
 

@@ -9,8 +9,6 @@ By default a perfect world: no soft tissue, an exact N-pose, palms that coincide
 the table, and sensors with noise and bias only. `Imperfections` add those of real people and sensors.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

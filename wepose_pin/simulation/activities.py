@@ -12,8 +12,6 @@ relative to the root, midway between the hips, so a person who sits down raises 
 root, which the accelerometers measure.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Imperfections of subject and sensors, each with its size, source and switch; and the sensor that has them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 

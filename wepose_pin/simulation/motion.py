@@ -4,8 +4,6 @@ It shares no code with the body room, since tests compare the two. The torso fra
 rotates about it.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise

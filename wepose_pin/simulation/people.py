@@ -1,7 +1,5 @@
 """How people differ from the model: shoulders, elbows, wrists, poses as they hold them, tissue under sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

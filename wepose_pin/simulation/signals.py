@@ -3,8 +3,6 @@
 All are closed forms, exact between the samples, with four continuous derivatives at least.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

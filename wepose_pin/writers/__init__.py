@@ -1,7 +1,5 @@
 """Writers: our own folders, and the formats of other programs."""
 
-from __future__ import annotations
-
 from .result import load_result, select_pose, write_session
 
 __all__ = ["load_result", "select_pose", "write_session"]

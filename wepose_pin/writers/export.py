@@ -1,7 +1,5 @@
 """A result, a person's or a robot's, as a file or a folder in a format of others."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import shutil

@@ -4,8 +4,6 @@ Sources: sensor_msgs/JointState, tf2_msgs/TFMessage, REP 105 (frames); rosbags' 
 0.4.4, lerobot/datasets/lerobot_dataset.py and utils.py.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence

@@ -10,8 +10,6 @@ the name first, ``nRows`` and ``nColumns``), TRCFileAdapter.cpp (.trc: eight key
 empty cell is missing).
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence

@@ -5,8 +5,6 @@ body also ``model.toml``, its table; of a mechanism also ``joints.parquet``. A c
 place of the pose and the summary.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io
