@@ -43,7 +43,7 @@ def test_it_says_how_well_lengths_and_mounts_are_known(session: Path, tmp_path: 
         assert [name.replace("_", " "), known] in [row[:2] for row in table]
     for name in subject.mounts:
         assert f"{np.degrees(subject.std(f'mounts.{name}.z')):.1f}°" in page
-    assert re.search(r"\d+\.\d mm before, \d+\.\d mm after", text_of(page))
+    assert re.search(r"samples used: \d+\.\d mm", text_of(page))
     banner = re.findall(r'<section class="banner (\w+)">', page)
     assert banner == [{0: "pass", 3: "poor", 4: "fail"}[code]]
 

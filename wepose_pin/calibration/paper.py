@@ -76,7 +76,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     if np.min(lengths) < MIN_LENGTH:
         shortest = f"{names[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} mm"
         raise NoSolution(f"{recording.where()}: the gap is least with {shortest}; {advice}")
-    gaps, prior_gaps = A @ lengths, A @ [prior.lengths[name] for name in names]
+    gaps = A @ lengths
     correlated = count_correlated_samples(gaps, data[-1])  # samples that make one independent one
     variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
     covariance = correlated * variance * by_gap + by_d @ d_cov @ by_d.T
@@ -98,7 +98,6 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         remarks=(*recording.diagnostics, *mount_diagnostics),
         time=recording.time[samples],
         gap=np.linalg.norm(gaps, axis=1),
-        prior_gap=np.linalg.norm(prior_gaps, axis=1),
         contact=np.ones(len(gaps)),
         quat_WL=quat_WL,
         measured_lengths={  # beside the prior alone: the gap is least without any length

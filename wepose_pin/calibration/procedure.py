@@ -303,12 +303,6 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
     scatter = estimate_scatter([hinge.std for hinge in hinges.values()])
     subject = _make_subject(problem, fit, x_cov, scatter)
     subject = replace(subject, hinges=hinges, note=f"{problem.protocol.title}; scale {scale}")
-    prior_x = fit.x.copy()
-    prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
-    gap, prior_gap = (
-        np.where(closed, np.linalg.norm(gaps, axis=1), np.nan)
-        for gaps in (fit.measure_gaps(fit.x), fit.measure_gaps(fit.place_points(prior_x)))
-    )
     diagnostics = [*problem.recording.diagnostics, *problem.diagnose_losses()]
     if not problem.protocol.closures:
         facts = {"protocol": problem.protocol.title, "prior": prior.note or prior.name}
@@ -325,8 +319,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, fit: LeastSquare
         scale_std=scale_std,
         remarks=tuple(diagnostics),
         time=problem.recording.time[samples],
-        gap=gap,
-        prior_gap=prior_gap,
+        gap=np.where(closed, np.linalg.norm(fit.measure_gaps(fit.x), axis=1), np.nan),
         contact=fit.contact,
         quat_WL=problem.orient_segments(subject.mounts, samples),
         measured_lengths=compare_measured(fit, problem.measured),

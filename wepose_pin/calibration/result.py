@@ -117,7 +117,6 @@ class Calibration:
     remarks: tuple[Diagnostic, ...]  # what is worth knowing, without what the quality says
     time: np.ndarray  # (n,) [s] of the samples
     gap: np.ndarray  # (n,) [m] size of the gap as estimated; NaN outside of closures
-    prior_gap: np.ndarray  # (n,) [m] the same with the prior's lengths
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
     quat_WL: Mapping[str, np.ndarray]  # segment → (n, 4) xyzw at each sample, as tracking gives it
     measured_lengths: Mapping[str, MeasuredLength]  # beside the estimates without them
@@ -156,15 +155,7 @@ class Calibration:
     @property
     def rms_gap(self) -> float:
         """[m] root mean square of the gap's length, where the hands are joined; NaN without a closure."""
-        return self._average(self.gap)
-
-    @property
-    def prior_rms_gap(self) -> float:
-        """[m] the same with the prior's lengths."""
-        return self._average(self.prior_gap)
-
-    def _average(self, gap: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(gap[self.touching] ** 2))) if self.touching.any() else np.nan
+        return float(np.sqrt(np.mean(self.gap[self.touching] ** 2))) if self.touching.any() else np.nan
 
     def __repr__(self) -> str:
         stds = [1e3 * std for name in self.subject.lengths if np.isfinite(std := self.subject.std(name))]

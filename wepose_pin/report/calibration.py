@@ -147,11 +147,11 @@ def _list_sensors(calibration: Calibration) -> list[Item]:
 
 
 def describe_gap(calibration: Calibration) -> str:
-    """The gap before and after, and how much the motion tells."""
+    """What is left of the gap, and how much the motion tells."""
     return (
-        f"{_name_gap(calibration)}, root mean square of the samples used: {1e3 * calibration.prior_rms_gap:.1f} mm "
-        f"before, {1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
-        f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
+        f"{_name_gap(calibration)}, root mean square of the samples used: {1e3 * calibration.rms_gap:.1f} mm. The "
+        f"effective sample size is {calibration.effective_sample_size:.0f}: neighbouring samples repeat the same "
+        f"information."
     )
 
 
@@ -165,20 +165,15 @@ def _find_mount_stds(subject: Subject, segment: str) -> tuple[float, float]:
 
 
 def draw_gap(calibration: Calibration, label: str) -> ReportFigure:
-    """The gap over time while touching, with the prior's and with the estimated lengths; `label` says what it is."""
+    """The gap over time while touching; `label` says what it is."""
     order = np.argsort(calibration.time, kind="stable")
     order = order[np.isfinite(calibration.gap[order])]
     time, touching = calibration.time[order], calibration.contact[order] >= MIN_CONTACT
     touching |= not touching.any()
     jumps = np.flatnonzero(np.diff(time) > 3.0 * np.median(np.diff(time))) + 1  # where a line breaks
-    gaps, styles = {}, {}
-    for name, gap, side, dashes in (
-        ("with the prior's lengths", calibration.prior_gap, "left", "--"),
-        ("with the estimated lengths", calibration.gap, "right", "-"),
-    ):
-        gaps[name] = np.insert(np.where(touching, 1e3 * gap[order], np.nan), jumps, np.nan)
-        styles[name] = {"color": COLOURS[side], "linestyle": dashes, "label": name}
-    caption = f"{label} over time, before and after. Where the line breaks they are apart."
-    figure = draw_over_time(np.insert(time, jumps, time[jumps]), {f"{label} [mm]": gaps}, caption, styles)
+    gap = np.insert(np.where(touching, 1e3 * calibration.gap[order], np.nan), jumps, np.nan)
+    caption = f"{label} over time. Where the line breaks they are apart."
+    lines, styles = {f"{label} [mm]": {"gap": gap}}, {"gap": {"color": COLOURS["right"]}}
+    figure = draw_over_time(np.insert(time, jumps, time[jumps]), lines, caption, styles)
     figure.axes[0].set_ylim(bottom=0.0)
     return figure

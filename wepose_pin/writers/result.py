@@ -123,7 +123,7 @@ def _document(calibration: Calibration) -> dict[str, Any]:
             joint: {"axis": subject.hinges[joint].axis, "rms_deg": np.degrees(rms)}
             for joint, rms in calibration.hinge_rms.items()
         },
-        "gap_rms": {"after": calibration.rms_gap, "before": calibration.prior_rms_gap},
+        "gap_rms": calibration.rms_gap,
         "open_intervals": calibration.open_intervals,
         "effective_sample_size": calibration.effective_sample_size,
         "moved": dict(calibration.exchanged),
