@@ -41,16 +41,15 @@ def case(seed: int) -> Case:
 
 @lru_cache
 def drawn(seed: int) -> Case:
-    """A trial whose sensor is drawn from what `AmekfParams` says of sensors: matrix, biases and noise in motion."""
+    """A trial whose sensor is drawn from what `AmekfParams` says of sensors: matrix, bias and noise in motion."""
     p = AmekfParams()
     rng = np.random.default_rng([seed, 5])
     sensor = simulate_paper_dynamic(seed, RATE)
     of = as_case(sensor, sensor.gyro_S)
     rate = np.vstack([np.zeros(3), (of.true[:-1].inv() * of.true[1:]).as_rotvec() * RATE])
     n = len(rate)
-    walk = p.motion_bias_walk / np.sqrt(RATE) * np.cumsum(rng.standard_normal((n, 3)), axis=0)
-    gyro = sensor.gyro_S + p.gyro_matrix_std * rate @ rng.standard_normal((3, 3))
-    gyro += of.moving[:, None] * (p.motion_bias_std * rng.standard_normal(3) + walk)
+    walk = p.gyro_bias_walk / np.sqrt(RATE) * np.cumsum(rng.standard_normal((n, 3)), axis=0)
+    gyro = sensor.gyro_S + walk + p.gyro_matrix_std * rate @ rng.standard_normal((3, 3))
     gyro += p.rate_noise * np.sqrt(RATE) * np.linalg.norm(rate, axis=1)[:, None] * rng.standard_normal((n, 3))
     return of._replace(gyro=gyro)
 

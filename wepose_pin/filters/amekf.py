@@ -3,11 +3,10 @@
 Pseudo-measurements correct it: the horizontal velocity and position of a sensor on a person are bounded. The specific
 force, rotated to the filter's world, is integrated to them (the almost-inertial frame of VQF, Laidig and Seel 2023,
 Information Fusion 91). A tilt error of 1° would give 8 m in 10 s; a segment does not move so far. The same innovations
-estimate the gyroscope's bias, its scale and misalignment (3×3), and the difference of the bias between motion and
-static phases, which rotation about horizontal axes makes observable. The heading is not observed; it improves with
-these parameters.
+estimate the gyroscope's bias, its scale and misalignment (3×3), which rotation about horizontal axes makes observable.
+The heading is not observed; it improves with these parameters.
 
-V is the sensor's own world: z up, heading that of the filter's start. The 25 errors (`ErrorStates`) are additive
+V is the sensor's own world: z up, heading that of the filter's start. The 22 errors (`ErrorStates`) are additive
 except the attitude error, a rotation on the left, in V: R = exp(θ) R_estimated. It does not change when the sensor
 rotates. Measured rate = (I + M) true rate + bias. Errors of velocity and position are those of
 the invariant filter (Barrau and Bonnabel 2017, IEEE TAC 62(4)): θ × g e_z alone drives them, so that their bound gives
@@ -34,25 +33,23 @@ from .phases import SensorNoise
 
 
 class ErrorStates(NamedTuple):
-    """Index range of each error among the 25."""
+    """Index range of each error among the 22."""
 
     attitude: slice = slice(0, 3)  # θ [rad], on the left, in V
     velocity: slice = slice(3, 5)  # [m/s], horizontal, in V
     position: slice = slice(5, 7)  # [m], horizontal, in V
-    gyro_bias: slice = slice(7, 10)  # [rad/s], in S, in a static phase
+    gyro_bias: slice = slice(7, 10)  # [rad/s], in S
     gyro_matrix: slice = slice(10, 19)  # M, rows first
     accel_bias: slice = slice(19, 22)  # [m/s²], in S
-    motion_bias: slice = slice(22, 25)  # [rad/s], in S: the gyroscope's bias in motion less that in a static phase
 
 
 ERROR = ErrorStates()
-STATES = 25
-COLUMNS = 32  # of matrices in the record: rows of whole processor vectors; beyond the 25 states they are zero
+STATES = 22
+COLUMNS = 24  # of matrices in the record: rows of whole processor vectors; beyond the 22 states they are zero
 PROPAGATED_STATES = 7  # θ, velocity and position change over a block, the other states stay
-SMOOTHED_STATES = (0, 1, 2, 7, 8, 9, 22, 23, 24)  # states that the smoother corrects: θ, bias, bias in motion
+SMOOTHED_STATES = (0, 1, 2, 7, 8, 9)  # states that the smoother corrects: θ, bias
 MAX_MEASUREMENTS = 5  # of a static block: velocity (2) and bias (3); of another: velocity (2) and position (2)
 VELOCITY, POSITION, GYRO_BIAS = ERROR.velocity.start, ERROR.position.start, ERROR.gyro_bias.start
-MOTION_BIAS = ERROR.motion_bias.start
 
 # Squared Mahalanobis distance beyond which an innovation of two or three axes is an outlier: χ² quantiles of 0.9973,
 # which is 3 σ of one axis.
@@ -63,7 +60,6 @@ BLOCK = np.dtype(
     [
         ("R", float, (3, 3)),  # Σ R_VS dt [s]
         ("R_rate", float, (3, 3, 3)),  # Σ R_VS ω_c dt [rad], for the axes c = x, y, z of S
-        ("R_moving", float, (3, 3)),  # Σ R_VS dt [s] over the samples that are not static
         ("length", float),  # [s]
         ("accel_s", float),  # [s] of that in which accel was measured
         ("lost_rotation_var", float),  # [rad²] of the rotation lost in the block
@@ -94,11 +90,9 @@ class AmekfParams(base.FilterParams):
     tilt_std: NonNegative = 0.2  # [rad] at the start, which may be in motion
     gyro_matrix_std: NonNegative = 0.002  # each entry of M
     gyro_matrix_walk: NonNegative = 1e-6  # [1/√s]
-    gyro_bias_walk: NonNegative = 5e-6  # [rad/s/√s], 10 deg/h in 100 s
+    gyro_bias_walk: NonNegative = 5e-5  # [rad/s/√s], 100 deg/h in 100 s: it changes with motion too
     static_bias_std: NonNegative = 1e-4  # [rad/s] of the mean of gyro over a static block about the bias, without sway
     static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s]
-    motion_bias_std: NonNegative = 1.7e-4  # [rad/s], 0.01 deg/s, bias in motion less that in a static phase
-    motion_bias_walk: NonNegative = 5e-5  # [rad/s/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg
     accel_bias_walk: NonNegative = 1e-4  # [m/s²/√s]
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
@@ -107,22 +101,20 @@ class AmekfParams(base.FilterParams):
 
 @kernel
 def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (7, m) with the rows of ``F P`` of θ, velocity and position, which differ from those of `P` (25, m).
+    """Fill `out` (7, m) with the rows of ``F P`` of θ, velocity and position, which differ from those of `P` (22, m).
 
-    θ⁺ = θ − Σ R dt b − Σ R ω dt M − Σ_moving R dt d, v⁺ = v + ∫ θ × g e_z − Σ R dt f, p⁺ = p + ∫ v, the integrals by
-    the trapezoid, of θ × g e_z while accel is measured; b, d, f are the errors of bias, bias in motion and
-    accelerometer bias.
+    θ⁺ = θ − Σ R dt b − Σ R ω dt M, v⁺ = v + ∫ θ × g e_z − Σ R dt f, p⁺ = p + ∫ v, the integrals by the trapezoid, of
+    θ × g e_z while accel is measured; b, f are the errors of the gyroscope's and the accelerometer's bias.
     """
     columns = P.shape[1]
-    bias, moving = P[ERROR.gyro_bias], P[ERROR.motion_bias]
-    matrix, force = P[ERROR.gyro_matrix], P[ERROR.accel_bias]
+    bias, matrix, force = P[ERROR.gyro_bias], P[ERROR.gyro_matrix], P[ERROR.accel_bias]
     for i in range(3):
         for j in range(columns):
             out[i, j] = P[i, j]
         for c in range(3):
-            R, R_moving = block.R[i, c], block.R_moving[i, c]
+            R = block.R[i, c]
             for j in range(columns):
-                out[i, j] -= R * bias[c, j] + R_moving * moving[c, j]
+                out[i, j] -= R * bias[c, j]
             x, y, z = block.R_rate[0, i, c], block.R_rate[1, i, c], block.R_rate[2, i, c]
             for j in range(columns):
                 out[i, j] -= x * matrix[3 * c, j] + y * matrix[3 * c + 1, j] + z * matrix[3 * c + 2, j]
@@ -254,12 +246,10 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     vertical = state.about_vertical
     vertical[base.HEADING] += block.correction[2]
     vertical[base.RATE_VAR] = 0.0
-    for i in range(3):  # of the bias in motion
-        b, m = GYRO_BIAS + i, MOTION_BIAS + i
-        vertical[base.RATE] += R[2, i] * (block.correction[b] + block.correction[m])
+    for i in range(3):
+        vertical[base.RATE] += R[2, i] * block.correction[GYRO_BIAS + i]
         for j in range(3):
-            c, n = GYRO_BIAS + j, MOTION_BIAS + j
-            vertical[base.RATE_VAR] += R[2, i] * R[2, j] * (P[b, c] + P[b, n] + P[m, c] + P[m, n])
+            vertical[base.RATE_VAR] += R[2, i] * R[2, j] * P[GYRO_BIAS + i, GYRO_BIAS + j]
     for i in range(VELOCITY, STATES):
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_VS, block.correction[0], block.correction[1], block.correction[2])
@@ -273,10 +263,8 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
 @inlined
 def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]. Return whether a block ended."""
-    dt, x, R, block, bias = model.dt, state.x, state.R_VS, state.block, state.gyro_bias
-    moving, began = 0.0 if static else 1.0, 1.0 if state.samples else 0.0
-    for i in range(3):
-        bias[i] = x[GYRO_BIAS + i] + moving * x[MOTION_BIAS + i]
+    dt, x, R, block, began = model.dt, state.x, state.R_VS, state.block, 1.0 if state.samples else 0.0
+    bias = x[ERROR.gyro_bias]
     ux, uy, uz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
     if is_measured:
         state.gyro_sum[0] += gx
@@ -298,7 +286,6 @@ def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-unty
             block.R_rate[0, i, c] = began * block.R_rate[0, i, c] + R_dt * ux
             block.R_rate[1, i, c] = began * block.R_rate[1, i, c] + R_dt * uy
             block.R_rate[2, i, c] = began * block.R_rate[2, i, c] + R_dt * uz
-            block.R_moving[i, c] = began * block.R_moving[i, c] + R_dt * moving
     velocity, position, force_bias = x[ERROR.velocity], x[ERROR.position], x[ERROR.accel_bias]
     position[0] += dt * velocity[0]
     position[1] += dt * velocity[1]
@@ -341,7 +328,7 @@ def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out
         for i in range(4):
             out_quat[k, i] = state.quat_VS[i]
         for i in range(3):
-            out_bias[k, i], out_vertical[k, i] = state.gyro_bias[i], state.about_vertical[i]
+            out_bias[k, i], out_vertical[k, i] = state.x[GYRO_BIAS + i], state.about_vertical[i]
 
 
 def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: AmekfParams) -> tuple[np.ndarray, ...]:
@@ -351,16 +338,13 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
     std[ERROR.attitude] = p.tilt_std, p.tilt_std, base.START_HEADING_STD
     std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
     std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
-    std[ERROR.motion_bias] = p.motion_bias_std
     np.fill_diagonal(P, std**2)
     P[ERROR.gyro_bias, ERROR.gyro_bias] = noise.gyro_bias_cov
-    bias_var = float(np.trace(noise.gyro_bias_cov)) / 3.0
     state = base.make_record(
         quat_VS=quat_VS,  # (4,) xyzw
-        gyro_bias=noise.gyro_bias,  # [rad/s] as returned: with the motion bias where the sample is not static
-        x=x,  # (25,) as `ErrorStates`; the attitude's error is always zero
-        P=P,  # (25, 32)
-        about_vertical=np.array([0.0, 0.0, bias_var + p.motion_bias_std**2]),  # as `Orientation`
+        x=x,  # (22,) as `ErrorStates`; the attitude's error is always zero
+        P=P,  # (22, 24)
+        about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
         last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
         lost_s=0.0,  # [s] the same
         # sums over the samples of the open block
@@ -389,14 +373,14 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
     noise_psd[ERROR.attitude] = gyro_var / rate_hz
     noise_psd[ERROR.velocity] = accel_var * noise.gravity**2 / rate_hz
     noise_psd[ERROR.gyro_bias], noise_psd[ERROR.gyro_matrix] = p.gyro_bias_walk**2, p.gyro_matrix_walk**2
-    noise_psd[ERROR.accel_bias], noise_psd[ERROR.motion_bias] = p.accel_bias_walk**2, p.motion_bias_walk**2
+    noise_psd[ERROR.accel_bias] = p.accel_bias_walk**2
     # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
     white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
     model = base.make_record(
         dt=1.0 / rate_hz,  # [s]
         block_samples=np.int64(block_samples),
         gravity=noise.gravity,  # [m/s²]
-        noise_psd=noise_psd,  # (25,) by which the variance of each state grows in a second
+        noise_psd=noise_psd,  # (22,) by which the variance of each state grows in a second
         velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
         position_var=p.position_std**2 * p.motion_s / length,  # [m²]
         static_velocity_var=p.static_speed_std**2,  # [m²/s²]

@@ -25,9 +25,9 @@ COUNT = len(SMOOTHED_STATES)
 
 @compiled
 def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
-    """Compute deviations (blocks + 1, 9) of the smoothed from the filtered states `SMOOTHED_STATES` after each block,
-    and the smoothed covariances (blocks + 1, 3, 3) of θ and of the bias in motion; the first of each is that of the
-    start, whose rows of P are `start_rows`."""
+    """Compute deviations (blocks + 1, 6) of the smoothed from the filtered states `SMOOTHED_STATES` after each block,
+    and the smoothed covariances (blocks + 1, 3, 3) of θ and of the bias; the first of each is that of the start, whose
+    rows of P are `start_rows`."""
     deviation = np.empty((len(blocks) + 1, COUNT))
     covs = np.empty((2, len(blocks) + 1, 3, 3))
     lam, Lam, rows, cov = np.zeros(STATES), np.zeros((STATES, STATES)), start_rows.copy(), np.empty((COUNT, COUNT))
@@ -44,8 +44,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
         for n in range(COUNT):
             cov[:, n] = rows[:, SMOOTHED_STATES[n]]
         cov -= np.dot(np.dot(rows, Lam), rows.T)
-        both = cov[3:6] + cov[6:9]  # the bias in motion: bias and what is added in motion
-        covs[0, k], covs[1, k] = cov[:3, :3], both[:, 3:6] + both[:, 6:9]
+        covs[0, k], covs[1, k] = cov[:3, :3], cov[3:, 3:]
         if k == 0:
             break
         block = blocks[k - 1]
@@ -64,7 +63,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, quat, bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
+def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, quat, bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
     """Correct the filter's run in place, sample by sample, between the corrections of its block's ends.
 
     They are taken in proportion to the time, or, where gyro was lost, to the variance of the turn that was lost up to
@@ -75,7 +74,7 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, qu
     for k in range(len(quat)):
         row = k // size
         end = min(row + 1, len(blocks))  # the last block may not be full: nothing was corrected in it
-        whole = k % size + 1 == size  # the filter has corrected this quaternion, not the bias it stated with it
+        whole = k % size + 1 == size  # the filter has corrected this sample
         share, bridge = (k % size + 1) / size, 0.0
         if row < len(blocks) and blocks[row].lost_rotation_var > 0.0 and not whole:
             lost, before = blocks[row].lost_rotation_var, start_trace
@@ -88,15 +87,14 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, qu
             bridge = so_far * (1.0 - share)
         for n in range(COUNT):
             after = deviation[end, n]
-            if row < len(blocks) and not (whole and n < 3):
+            if row < len(blocks) and not whole:
                 after += blocks[row].correction[SMOOTHED_STATES[n]]
             e[n] = (1.0 - share) * deviation[row, n] + share * after
         for i in range(9):
             P[i] = (1.0 - share) * cov[row, i] + share * cov[end, i]
         rotate_by_world_vector(quat[k], e[0], e[1], e[2])
-        moving = 0.0 if static[k] else 1.0
         for c in range(3):
-            bias[k, c] += e[3 + c] + moving * e[6 + c]
+            bias[k, c] += e[3 + c]
         fill_matrix(quat[k], R)
         into_sensor(R, P, bridge, 0.0, attitude_cov[k])
         # Smoothed headings and biases know the whole recording from the first sample on: nothing is corrected later.
@@ -110,11 +108,10 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, qu
 def _smooth(states: np.ndarray, models: np.ndarray, *arrays: np.ndarray) -> None:
     """Smooth a whole recording; each call starts anew, so that a recording cut in two is two recordings."""
     P_rows, size = states["P"][0, list(SMOOTHED_STATES), :STATES], int(models["block_samples"][0])
-    (gyro_S, _, static), out = arrays[:3], arrays[3:]
-    blocks = np.empty(len(gyro_S) // size, BLOCK)
+    blocks = np.empty(len(arrays[0]) // size, BLOCK)
     amekf.run(states.copy(), models, blocks, *arrays)
     smoothed = _backward(blocks, P_rows, float(models["gravity"][0]))
-    _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, static, *out)
+    _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, *arrays[3:])
 
 
 SMOOTHER = OrientationFilter(amekf.make_records, _smooth, amekf.AmekfParams)
