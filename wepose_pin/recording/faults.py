@@ -15,7 +15,7 @@ import numpy as np
 from ..compilation import compiled, inlined, kernel
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from .intervals import find_runs, format_time
+from .intervals import format_time
 from .limits import NARROWEST_GYRO_RANGE
 
 # Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
@@ -141,7 +141,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             (GYRO, (gyro_S,), of_gyro, STUCK_S),
             (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
-            first, last = np.array(find_runs(repeats) if repeats.any() else [], dtype=int).reshape(-1, 2).T - 1
+            first, last = np.flatnonzero(np.diff(repeats, prepend=False, append=False)).reshape(-1, 2).T - 1
             length = last - first + 1
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             if not long.any():
