@@ -8,13 +8,5 @@ three-dimensional motions: application to the knee", Journal of Biomechanical En
 10.1115/1.3138397.
 """
 
-from .joints import AUTO as AUTO
-from .joints import JOINTS as JOINTS
-from .joints import NEAR_LOCK as NEAR_LOCK
-from .joints import Angles as Angles
-from .joints import JointAngles as JointAngles
-from .joints import diagnose_lock as diagnose_lock
-from .joints import group_sides as group_sides
-from .joints import joint_angles as joint_angles
-from .movement import angle_table as angle_table
-from .movement import summary as summary
+from .joints import AUTO, JOINTS, NEAR_LOCK, Angles, JointAngles, diagnose_lock, group_sides, joint_angles
+from .movement import angle_table, summary

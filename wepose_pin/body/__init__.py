@@ -12,14 +12,6 @@ from the start pose. `configuration` solves for joints and points from orientati
 which make a `Pose`; `kinematics` has that, places links and points and says how well they are known.
 """
 
-from .body import BodyModel as BodyModel
-from .body import load_model as load_model
-from .table import DEFAULT_BODY as DEFAULT_BODY
-from .table import ROOT as ROOT
-from .table import SEXES as SEXES
-from .table import BodyTable as BodyTable
-from .table import Limb as Limb
-from .table import convert_breadths as convert_breadths
-from .table import list_breadths as list_breadths
-from .table import load_table as load_table
-from .urdf import Visual as Visual
+from .body import BodyModel, load_model
+from .table import DEFAULT_BODY, ROOT, SEXES, BodyTable, Limb, convert_breadths, list_breadths, load_table
+from .urdf import Visual

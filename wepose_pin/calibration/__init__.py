@@ -6,13 +6,7 @@ and `problem` collects inputs and samples. `equations` has the unknowns, the res
 `nlpsol`; `result` is what it makes, and how good that is. `paper` is the published calibration of the lengths alone.
 """
 
-from .paper import Formulation as Formulation
-from .procedure import MEASURED_STD as MEASURED_STD
-from .procedure import calibrate as calibrate
-from .protocols import PROTOCOLS as PROTOCOLS
-from .protocols import Protocol as Protocol
-from .protocols import load_protocol as load_protocol
-from .result import Calibration as Calibration
-from .result import CalibrationQuality as CalibrationQuality
-from .result import Check as Check
-from .result import assess as assess
+from .paper import Formulation
+from .procedure import MEASURED_STD, calibrate
+from .protocols import PROTOCOLS, Protocol, load_protocol
+from .result import Calibration, CalibrationQuality, Check, assess

@@ -20,19 +20,9 @@ from ..diagnostics import Diagnostic
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, WrongUnit, one_of
 from .faults import check_arrays, find_gyro_range
-from .intervals import Intervals as Intervals
-from .intervals import check_phases as check_phases
-from .intervals import check_time as check_time
-from .intervals import find_runs as find_runs
-from .intervals import format_span as format_span
-from .intervals import format_time as format_time
-from .intervals import select_interval as select_interval
+from .intervals import Intervals, check_phases, check_time, find_runs, format_span, format_time, select_interval  # noqa: F401
 from .plausibility import check_signals
-from .sensors import AXES as AXES
-from .sensors import ImuSensor as ImuSensor
-from .sensors import OrientationSensor as OrientationSensor
-from .sensors import Sensor as Sensor
-from .sensors import compute_rate as compute_rate
+from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_rate  # noqa: F401
 
 
 def compute_mount(up: str, forward: str) -> np.ndarray:
