@@ -12,8 +12,6 @@ and one of three axes is a proper one turned by a right angle: ``R_k(c) = T R_i(
 ``R T = R_i(a) R_j(b − ε π/2) R_i(c)``. `tip` below is the proper sequence's b: the lock is where it is 0 or π.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A pose → the angles of its joints, after Wu et al. 2005 and 2002 and, of the knee, Grood and Suntay 1983."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 A table has a row an angle, in degrees; what is not determined is NaN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

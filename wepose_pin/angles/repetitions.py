@@ -1,7 +1,5 @@
 """The repetitions of a movement, excursions of one angle out and back, and their time-normalised curves, 0 to 100 %."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ The base is fixed and nothing but gravity acts on the body: no ground, no load i
 derivatives of measured orientations, so the motion is low-passed first, forwards and backwards (−6 dB at the cut-off).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise

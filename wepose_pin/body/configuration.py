@@ -9,8 +9,6 @@ all its segments; a spine without a spherical joint, with all that hangs on it; 
 follow the limbs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np

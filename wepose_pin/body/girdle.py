@@ -10,8 +10,6 @@ A person differs from the law by seven parameters: the share by which the law is
 that segment [m] a place at rest, and a displacement at 90° that grows with s.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple

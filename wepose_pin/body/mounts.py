@@ -7,8 +7,6 @@ calibrated mount. A calibrated mount is fused with the start pose, whose standar
 person's segment frames L equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 

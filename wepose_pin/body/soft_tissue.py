@@ -1,7 +1,5 @@
 """How large a person's own errors are: of soft tissue, whose means are corrected, and of the start pose."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 

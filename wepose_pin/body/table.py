@@ -3,8 +3,6 @@
 Outside simulation and joint angles no module names a segment, a point or a length.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

@@ -8,8 +8,6 @@ between the root and the point, with l the lengths: each link contributes a vect
 constant in the link. The joints of a girdle stand at zero here: what they add is in `girdle`.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence

@@ -1,7 +1,5 @@
 """URDF files: read by yourdfpy, with the meshes that they name."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import re

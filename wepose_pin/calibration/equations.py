@@ -27,8 +27,6 @@ bends. Each sample has the same residuals: three of its condition and one for ea
 zero.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from functools import cached_property

@@ -15,8 +15,6 @@ torso's sensor sideways as the torso leans forwards has the same effect on the c
 joint's acceleration, since orientation and specific force are the sensor's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

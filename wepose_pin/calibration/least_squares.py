@@ -5,8 +5,6 @@ Gauss-Newton the residual's own mean square gives its variance, and its autocorr
 Samples at which the palms are apart are outliers and lose their weight.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

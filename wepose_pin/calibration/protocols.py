@@ -14,8 +14,6 @@ those of the body's table (`wepose_pin.body.BodyTable`). There are four kinds of
 The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path

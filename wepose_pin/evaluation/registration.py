@@ -7,8 +7,6 @@ so, is what the fit comes nearest to. Frames of segments are a constant rotation
 what is scored is then without any constant error of mounts and frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """How wrong a pose is against a reference: attitude, joint angles, positions, and how far its stated ± is right."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple

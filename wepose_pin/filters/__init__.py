@@ -4,8 +4,6 @@
 `estimate_orientation` runs one on an array, from the static phase to the orientations.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -17,8 +17,6 @@ exact in the sums of R_VS and R_VS ω. In a static block (static phase of Lisini
 velocity is zero and the gyroscope measures its bias.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

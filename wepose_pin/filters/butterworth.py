@@ -1,7 +1,5 @@
 """Butterworth filters of second order as `butter`, `sosfiltfilt` and `sosfilt` of SciPy, which takes 0.5 s to load."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..compilation import kernel

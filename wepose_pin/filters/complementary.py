@@ -10,8 +10,6 @@ across q it is −2 q ⊗ e. So ω = gyro − b + 2 β e/‖e‖: the step of NC
 the static phase's and stays; their bias step needs a magnetometer.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The static phases from which filters start: noise, bias and tilt of sensors in them, their intervals and checks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

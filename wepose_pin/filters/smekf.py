@@ -15,8 +15,6 @@ person's sway and the accelerometer's bias are correlated from sample to sample,
 are inflated: many samples of a static phase count as few.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

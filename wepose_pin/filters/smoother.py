@@ -10,8 +10,6 @@ for each block, which inverts nothing. It goes from block to block of the filter
 take the corrections of both ends in proportion.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..compilation import compiled

@@ -13,8 +13,6 @@ compares the mean gyro of the window's newest part with that of the window. The 
 the rate.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -23,8 +23,6 @@ accelerometer that averages over its sample is late by half of it against its gy
 each side is B a.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any

@@ -3,8 +3,6 @@
 `Tracker` does it, chunk by chunk; `track` gives it a recording as one chunk, `track_chunks` in chunks.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

@@ -14,8 +14,6 @@ Errors by soft tissue, tilted hinge axes and travelling joints are correlated ov
 They are states, so that a long recording does not average them away.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 

@@ -5,8 +5,6 @@ The filters' tilt is good and their headings drift. Time is cut into intervals o
 Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is corrected over the next one.
 """
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`SegmentOrientations`: what is estimated of a recording's segments, and how; the covariances of segments in W."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

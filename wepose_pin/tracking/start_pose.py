@@ -1,7 +1,5 @@
 """The start pose of causal tracking: detecting its end, and cutting it out of a recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

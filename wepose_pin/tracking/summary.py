@@ -5,8 +5,6 @@ add up in variance. The correlation of lengths and girdles goes to the lengths, 
 sensors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property

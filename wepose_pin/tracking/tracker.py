@@ -4,8 +4,6 @@ Chunks and single samples go through the same compiled steps, so that a live ses
 bit-identical quaternions.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
