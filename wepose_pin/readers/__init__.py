@@ -275,7 +275,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
             sensor = ImuSensor(signals["gyro"], signals["accel"], each.mount, gap, gyro_range[segment])
         sensors[segment] = clocks.resample(sensor, clock.time, time) if resampled else sensor
         diagnostics += _report_bridged_gaps(segment, missing, long_gap, clock.step)
-    rate_hz = clocks.measure_rate(time)
+    rate_hz = round((len(time) - 1) / float(time[-1] - time[0]), 4)  # seconds since 1970 are off by 1e-6 Hz
     recording = replace(head, time=time, rate_hz=rate_hz, sensors=sensors, diagnostics=tuple(diagnostics))
     recording.check()
     return replace(recording, diagnostics=(*recording.diagnostics, *recording.check_signals()))

@@ -125,17 +125,6 @@ def guess_time_unit(step: float) -> str | None:
     return next((name for name, unit in TIME_UNITS.items() if 1e-4 < step * unit < LONGEST_STEP_S), None)
 
 
-def measure_rate(time: np.ndarray) -> float:
-    """Measure the mean rate [Hz] of even times (n,) [s], to a thousandth where the times are rounded by as much.
-
-    1.7e9 s are written to 0.2 µs, by which 100 Hz over half a minute are 1e-6 Hz off.
-    """
-    duration = float(time[-1] - time[0])
-    rate_hz = (len(time) - 1) / duration
-    error = rate_hz * 2.0 * float(np.spacing(max(abs(time[0]), abs(time[-1])))) / duration
-    return round(rate_hz, 3) if abs(round(rate_hz, 3) - rate_hz) <= error else rate_hz
-
-
 def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarray, tuple[Diagnostic, ...]]:
     """Find one time base (n,) [s] for all sensors, with a diagnostic where they must be resampled.
 
