@@ -270,7 +270,7 @@ def test_sensors_with_clocks_of_their_own_come_to_one_time(own_rate: float, sens
         assert np.abs(accel - true_orientation(time).inv().apply([0.0, 0.0, 9.81])).max() < 0.05
     (resampled,) = recording.diagnostics
     assert (resampled.code, resampled.facts["variant"]) == ("time-stamps-uneven", "clocks")
-    assert "`rate_hz` would lose when each sensor began" in str(resampled)
+    assert "With `rate_hz`, the start of each sensor is lost" in str(resampled)
 
 
 def test_a_faster_sensor_is_averaged_so_that_its_noise_does_not_fold_down(tmp_path: Path) -> None:
