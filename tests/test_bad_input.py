@@ -145,7 +145,7 @@ SAYS = [
 PUTS = [
     ("gy", slice(40, 41), "0,125", "column 'gy' holds text in row 41: '0,125'; write decimals with a point: 0.125"),
     ("ax", slice(6, 7), "n.v.", "arm.csv: column 'ax' holds text in row 7: 'n.v.'; it must be a number"),
-    ("az", slice(70, 71), float("inf"), "arm.csv: column 'az' holds inf in row 71; it must be a number"),
+    ("az", slice(70, 71), float("inf"), "arm.csv: column 'az' holds inf in row 71; no device measures as much"),
     ("gx", slice(None), None, "sensors.torso.gyro: no numbers from 0 to"),
     (
         "time",

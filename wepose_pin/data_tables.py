@@ -19,6 +19,7 @@ from .errors import BadData, MissingFile, one_of
 from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
+LARGEST_NUMBER = 1e30  # that is a measurement in some unit; squares of smaller numbers are finite
 FIRST_BYTES = 1 << 20  # in which the first lines of a file stand
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 MOST_PREAMBLE, MOST_COMMENTS = 100, 2000  # first lines of a CSV in which its names stand, and comments before them
@@ -154,8 +155,9 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
         elif not series.dtype.is_numeric() and series.dtype != pl.Null:
             raise BadData(f"{holds} values of type {series.dtype}; it must hold numbers")
         numbers = series.cast(pl.Float64)
-        if numbers.is_infinite().any():
-            raise BadData(f"{holds} inf in row {int(numbers.is_infinite().arg_max() or 0) + 1}; it must be a number")
+        if (too_large := numbers.abs() > LARGEST_NUMBER).any():
+            row = int(too_large.arg_max() or 0)
+            raise BadData(f"{holds} {numbers[row]:.3g} in row {row + 1}; no device measures as much")
         columns.append(numbers.fill_null(float("nan")).rename(name))
     return np.ascontiguousarray(pl.DataFrame(columns).to_numpy().reshape(table.height, len(names)))
 

@@ -23,7 +23,7 @@ from ..recording.clocks import TIME_UNITS, Clock
 from ..recording.faults import Fault, check_sensors
 from ..recording.intervals import Intervals, check_phases, find_runs, format_span
 from .arrays import ArrayFile, is_array_file
-from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device, check_measured
+from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED, Device
 from .live_log import is_live_log as is_live_log
 from .live_log import read_live_log as read_live_log
 from .registry import detect_format, find_format, read_device
@@ -377,7 +377,6 @@ def _bridge_gaps(
         frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
     signals, lost = {}, frozen.copy()
     for signal, values in rows.items():
-        check_measured(f"{place}{signal}", values)
         signals[signal], good = _place_on_clock(values, clock, f"{place}{signal}", signal == "orientation")
         lost |= ~good
         if lost.all():

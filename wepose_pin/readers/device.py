@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..body import load_table
+from ..data_tables import LARGEST_NUMBER
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, one_of
 from ..libraries import library_errors
 from ..recording.clocks import interpolate, spread_equal_times
-from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
+from ..recording.limits import STANDARD_GRAVITY
 from .guess import guess_unit
 
 # What a sensor is read for → the signals that it needs.

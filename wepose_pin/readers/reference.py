@@ -138,7 +138,6 @@ def _read_trc(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if len(rows) < 2 or not np.all(np.diff(rows[:, 1]) > 0.0):
         problem = "the times of its rows do not increase" if len(rows) > 1 else f"{len(rows)} rows of markers"
         raise BadData(f"{path}: {problem}; a recording has at least 2 rows, and time grows")
-    check_measured(f"{path}: a marker", rows[:, 2:])
     points = UNITS[unit] * rows[:, 2:].reshape(len(rows), -1, 3)
     return rows[:, 1], {name: points[:, k] for k, name in enumerate(names)}
 

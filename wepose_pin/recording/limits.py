@@ -10,8 +10,6 @@ HIGHEST_ACCEL = 4000.0  # [m/s²]
 # The squared norm of a plausible vector is below these limits; that of a vector with a NaN is not.
 HIGHEST_RATE_SQUARED = 3.0 * HIGHEST_RATE**2
 HIGHEST_ACCEL_SQUARED = 3.0 * HIGHEST_ACCEL**2
-# Larger numbers are no measurement in any unit. Squares of smaller numbers are finite.
-LARGEST_NUMBER = 1e30
 
 # No axis saturates below the narrowest ranges on the market, ±125 deg/s = 2.18 rad/s and ±2 g = 19.6 m/s².
 NARROWEST_GYRO_RANGE = 2.0  # [rad/s]
