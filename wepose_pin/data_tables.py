@@ -23,7 +23,7 @@ LARGEST_NUMBER = 1e30  # that is a measurement in some unit; squares of smaller 
 FIRST_BYTES = 1 << 20  # in which the first lines of a file stand
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 MOST_PREAMBLE, MOST_COMMENTS = 100, 2000  # first lines of a CSV in which its names stand, and comments before them
-_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
+NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
 _UNITS = re.compile(
     r"[\[(]?(s|ms|[uµμ]s|ns|sec(onds?)?|m/\(?s(\^2|²|/s|\^2\))\)?|m/s\*\*2|m?g|deg(rees)?|rad|(deg|rad|°|dps)(/s(ec)?)?|"
     r"[unµμ]?T|gauss|°c|degrees celsius|k?pa|hz|m?v|%|n/?a|no_units|local_flux|-|1)[\])]?",
@@ -216,7 +216,7 @@ def read_layout(path: Path) -> CsvLayout:
     def share(k: int, pattern: re.Pattern[str]) -> float:
         return sum(map(bool, map(pattern.fullmatch, filled[k]))) / max(len(filled[k]), 1)
 
-    numeric = next((k for k in range(1, len(rows)) if len(filled[k]) > 1 and share(k, _NUMBER) > 0.5), 1)
+    numeric = next((k for k in range(1, len(rows)) if len(filled[k]) > 1 and share(k, NUMBER) > 0.5), 1)
     width, above, units = len(rows[min(numeric, len(rows) - 1)]), numeric - 1, list[str]()
     if above and len(rows[above]) == width and share(above, _UNITS) >= 0.5:
         units = rows[above]

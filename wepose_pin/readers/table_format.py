@@ -18,7 +18,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..data_tables import parse_rows, read_body, read_columns, read_first_lines
+from ..data_tables import NUMBER, parse_rows, read_body, read_columns, read_first_lines
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import Key, TomlTable, read_record, read_toml
 from ..errors import BadData, BadSession, MissingRate
@@ -30,7 +30,6 @@ MOST_LINES = 200  # up to the names
 MOST_AFTER = 4  # lines of text between the names and the numbers
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "wxyz"}
 _COUNTS = {"gyro": (1, 3), "accel": (1, 3), "orientation": (1, 3, 4, 9)}  # of columns; 1 is a pattern
-_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?", re.IGNORECASE)
 _STATED_RATE = re.compile(r"\d+(\.\d*)?(?![\d.])")
 _Line = Annotated[float, Key(least=-MOST_AFTER, most=MOST_AFTER)]  # counted from the line of names; 0: there is none
 
@@ -221,7 +220,7 @@ def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
     about = {name.strip(): value.strip(f" {SEPARATORS}") for name, colon, value in lines_before if colon}
     first = k + 1 + int(max(format.axes_line, format.units_line, 0.0))
     for cells in (_split(row, separator) for row in lines[first : first + MOST_AFTER]):
-        if any(map(_NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
+        if any(map(NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
             break
         first += 1
     body = read_body(path, first)
