@@ -181,7 +181,7 @@ def test_a_session_is_readable_once_the_marks_of_its_comments_are_gone(
     pl.DataFrame(columns).write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv", "--write")
     assert ("CHECK" in text) == ("CHECK" in (tmp_path / "session.toml").read_text(encoding="utf-8"))
-    assert "take the # off" in text
+    assert "remove the #" in text
     with pytest.raises(wp.WeposeError, match="without # before its lines"):
         wp.load_session(tmp_path)
     session = (tmp_path / "session.toml").read_text(encoding="utf-8").replace("# # ", "# ")

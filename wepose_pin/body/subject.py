@@ -39,7 +39,7 @@ _DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=5, each=("rate_d
 _UNIT = Key(least=-1.001, most=1.001, digits=9)  # of a component of a unit vector
 _MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",))
 _GIRDLE = Key(least=-LONGEST, most=LONGEST, each=PARAMETERS, digits=6)
-_COMMENT = "# Lengths and girdles in m; mounts turn the sensor's frame to the segment's; see docs/calibrate.md"
+_COMMENT = "# Lengths and girdles in m; mounts rotate the sensor's frame to the segment's; see docs/calibrate.md"
 
 
 class Hinge(NamedTuple):

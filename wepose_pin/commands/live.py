@@ -55,9 +55,9 @@ def live(
 ) -> None:
     """Track a person live: show the pose in the browser and the terminal, send it to programs or a robot, record it.
 
-    Stand still in the start pose until the message says that it is ready. After that, stand in the start pose again and
-    press r to reset the headings. With --robot, r also lets a stopped robot move again. q or Ctrl-C ends the session.
-    If it is killed, at most the last quarter of a second of --record is lost.
+    Stand still in the start pose until the message says "ready". To reset the headings later, stand in the start pose
+    again and press r. With --robot, r also lets a stopped robot move again. q or Ctrl-C ends the session. If it is
+    killed, at most the last quarter of a second of --record is lost.
 
     Example: wepose live --source udp:9000 --subject anna --record morning.mcap
 

@@ -197,8 +197,8 @@ def _print_errors(errors: Evaluation) -> None:
     print_table("Position error [mm], mean ± std", ("point", "from the root", "from where its limb begins"), rows)
     points = {f"{name} (point)": stated for name, stated in errors.position_uncertainty.items()}
     print_table(
-        "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
-        ("of", "normalised", "within 1 std", "within 2 std"),
+        "Stated uncertainty: if right, the normalised squared error is 3, and 68 % and 95 % of the errors are within",
+        ("quantity", "normalised", "within 1 std", "within 2 std"),
         [
             (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
             for name, u in {**errors.attitude_uncertainty, **points}.items()

@@ -157,12 +157,12 @@ def _read_proposed(about: Description, folder: Path) -> None:
 def _advise(about: Description, body: BodyTable) -> str:
     if about.recording is None:
         return "mend what cannot be read"
-    sensors, then = about.recording.sensors, "wepose track SESSION -o result"
+    sensors, then = about.recording.sensors, "run wepose track SESSION -o result"
     if not all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in sensors.values()):
-        calibrate = "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject"
+        calibrate = "add the seconds of clasp to [phases] and run wepose calibrate SESSION -o subject"
         then = f"{calibrate}; or state the mounts and {then}"
     if not set(sensors) <= set(body.segments):
-        then = f"take the # off the lines of each sensor with ? and write its segment in place of SEGMENT; then {then}"
+        then = f"remove the # from the lines of each sensor with ? and replace SEGMENT by its segment; then {then}"
     return then
 
 
@@ -269,7 +269,7 @@ def _propose_from_device(path: Path, folder: Path, name: str, body: BodyTable) -
     if name == "wepose_live":
         log = read_live_log(path)
         about.facts.append(f"of {log.header['name']}, live by {log.header['method']}: {len(log.quat_WL)} poses")
-        about.facts.append(f"track it as it was: wepose track {path} -o result; to change its phases: --write")
+        about.facts.append(f"to track it as it was live: wepose track {path} -o result; to change its phases: --write")
         about.phases = log.recording.phases
     return about
 
@@ -313,7 +313,7 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
     if any("gyro" in signals for signals in guess.sensors.values()):
         about.data["gyro_unit"] = guess.units.get("gyro", "rad/s")
         if "gyro" not in guess.units:
-            about.checks["gyro_unit"] = "neither the file nor the motion says so"
+            about.checks["gyro_unit"] = "neither the file nor the motion shows the unit"
         about.data["accel_unit"] = guess.units.get("accel", "m/s^2")
     for segment, signals in guess.sensors.items():
         about.sensors[segment] = {name: own if len(own) > 1 else own[0] for name, own in signals.items()}
@@ -413,5 +413,5 @@ def _propose_mount(recording: Recording, segment: str, static: Sequence[tuple[fl
         force = sensor.accel_S[recording.span(static[0]) if static else slice(max(1, round(recording.rate_hz)))]
         up = max(AXES, key=lambda axis: float(AXES[axis] @ force.mean(axis=0)))
         where = "where it is static" if static else "in the first second"
-        hint = f"up as gravity says {where}; write the axis ahead for ?, without the #"
+        hint = f"gravity shows up {where}; replace ? by the axis that points forward, and remove the #"
     return f'# mount = {{ up = "{up}", forward = "?" }}   # {hint}'
