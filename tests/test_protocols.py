@@ -144,7 +144,6 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
             "[[motion]]\nsegment = 'torso'\n[[closure]]",
             r"motion 1.segment is not a known key; there is: phase",
         ),
-        ("needs =", "measured_example = 'foo=1'\nneeds =", "measured_example: 'foo' is no length"),
         ("needs =", "needs ==", r"not valid TOML"),
         ("needs =", "needs = 3 #", r"needs = 3; a list of texts is needed"),
         ("needs =", "needs = [3] #", r"needs\[0\] = 3; a text is needed"),

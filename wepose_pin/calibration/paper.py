@@ -127,7 +127,7 @@ def _check_problem(problem: CalibrationProblem) -> None:
         single = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
             f"formulation 'paper' needs one measured length that fixes the scale, as in `measured` "
-            f"{protocol.measured_example}; {one_of(single)}"
+            f"{problem.measured_example}; {one_of(single)}"
         )
 
 

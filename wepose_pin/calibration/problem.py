@@ -40,6 +40,7 @@ FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phas
 # Standard deviations [rad] of a stated mount's heading, as mounts name sensor axes that are estimated by eye, and of an
 # unknown heading: the whole circle.
 STATED_STD, HEADING_STD = np.deg2rad(10.0), np.pi / np.sqrt(3.0)
+BREADTH = "biacromial"  # the measurement that fixes the scale of joined hands best (docs/calibrate.md)
 MOST_LAYOUTS = 4  # that are remembered
 _layouts: dict[tuple[Any, ...], Layout] = {}
 
@@ -86,13 +87,11 @@ class CalibrationProblem:
 
     @property
     def measured_example(self) -> str:
-        """The best measurement of the scale, ``name=metres``: the protocol's, then the longest length that counts."""
-        example, table = self.protocol.measured_example, self.model.table
+        """The best measurement of the scale, ``name=metres``: a breadth, then the longest length that counts."""
         lengths = self.layout.lengths_in_closures or self.model.lengths
         names = [name for name in lengths if name not in self.measured]
-        is_known = example.partition("=")[0] in (*table.lengths, *list_breadths(table))
-        if not names or (is_known and not self.measured):
-            return example
+        if (BREADTH in list_breadths(self.model.table) and not self.measured) or not names:
+            return f"{BREADTH}=0.41"
         return f"{max(names, key=self.model.lengths.__getitem__)}=METRES"
 
     # Mounts and labels ------------------------------------------------------------------------------------------------

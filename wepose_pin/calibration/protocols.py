@@ -21,7 +21,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..body import BodyModel, BodyTable, list_breadths, load_table
+from ..body import BodyModel, BodyTable
 from ..body.mounts import PALM_SLIP_STD, StartPose
 from ..body.table import ZERO, Vector, check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
@@ -117,7 +117,6 @@ class Protocol:
     needs: tuple[str, ...]  # segments that must carry a sensor
     steps: Annotated[tuple[Step, ...], None]  # for the person
     conditions: Annotated[tuple[Condition, ...], None]  # for the solver
-    measured_example: str = ""  # the length that fixes the scale best, as ``name=metres``; empty: any
 
     @property
     def closures(self) -> tuple[Closure, ...]:
@@ -132,9 +131,6 @@ class Protocol:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
         check_segments(table, (*named, *self.needs), where, BadOption)
-        measured = self.measured_example.partition("=")[0]
-        if measured and not any(measured in (*each.lengths, *list_breadths(each)) for each in (table, load_table())):
-            raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
     def resolve(
         self, model: BodyModel, start: StartPose, recording: Recording
@@ -194,7 +190,6 @@ def load_protocol(name: str | Path) -> Protocol:
             tuple(dict.fromkeys(segment for each in parts for segment in each.needs)),
             tuple(step for each in steps for step in each),
             tuple(condition for each in parts for condition in each.conditions),
-            next((each.measured_example for each in parts if each.measured_example), ""),
         )
     if str(name).endswith(".toml"):
         return _read_protocol(Path(name))
