@@ -185,14 +185,14 @@ def test_a_session_is_readable_once_the_marks_of_its_comments_are_gone(
     with pytest.raises(wp.WeposeError, match="without # before its lines"):
         wp.load_session(tmp_path)
     session = (tmp_path / "session.toml").read_text(encoding="utf-8").replace("# # ", "# ")
-    assert session.count('[["FROM", "TO"]]') == 2
+    assert session.count('[["FROM", "TO"]]') == 3
     session = session.replace('[["FROM", "TO"]]', f"[[{begin + 0.5}, {begin + 4.5}]]")
     session = re.sub(r"^# (?!mount)", "", session, flags=re.MULTILINE)
     for segment in ("torso", "left_upper_arm"):
         session = session.replace("sensors.SEGMENT", f"sensors.{segment}", 1)
     (tmp_path / "session.toml").write_text(session, encoding="utf-8")
     recording = wp.load_session(tmp_path)
-    assert set(recording.phases) == {"start", "clasp"}
+    assert set(recording.phases) == {"start", "clasp", "t_pose"}
     assert set(recording.sensors) == {"torso", "left_upper_arm"}
 
 

@@ -396,6 +396,7 @@ def _format_session(about: Description, folder: Path, body: BodyTable, model: Pa
         # A sensor on an unknown segment may be one that is needed.
         if body.draw.paths and not (set(about.sensors) <= set(segments) and set(body.needed) - set(about.sensors)):
             lines.append('# clasp = [["FROM", "TO"]]   # for wepose calibrate: the seconds with the palms together')
+            lines.append('# t_pose = [["FROM", "TO"]]   # the same, if there was one: arms held sideways, five seconds')
     for segment in sorted(about.sensors, key=lambda name: segments.index(name) if name in segments else 99):
         known = segment in segments
         table = [f"[sensors.{segment if known else 'SEGMENT'}]"]

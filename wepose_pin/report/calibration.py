@@ -125,7 +125,7 @@ def tabulate_mounts(calibration: Calibration) -> Table:
         offset, drift = subject.start_pose_offset.get(name), subject.heading_drift.get(name)
         up, forward = find_mount_axes(quat_LS)
         off = (Rotation.from_quat(compute_mount(up, forward)).inv() * Rotation.from_quat(quat_LS)).magnitude()
-        axes = f"{up} up, {forward} ahead, turned {np.degrees(off):.0f}°".replace("-", "−")
+        axes = f"{up} up, {forward} forward, turned {np.degrees(off):.0f}°".replace("-", "−")
         stds = (number(std, 1, "°") for std in _find_mount_stds(subject, name))
         at_start = number(np.degrees(np.linalg.norm(offset[:2])) if offset is not None else np.nan, 1, "°")
         rate = number(60.0 * np.degrees(drift[0]), 1, " °/min", "+") if drift is not None else ""
