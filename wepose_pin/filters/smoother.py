@@ -6,7 +6,7 @@ on. The backward pass is that of Rauch, Tung and Striebel 1965 (AIAA Journal 3(8
 
     λ ← (I − K h)ᵀ λ − h y/s,  Λ ← (I − K h)ᵀ Λ (I − K h) + h hᵀ/s  for each measurement, and  λ ← Fᵀ λ,  Λ ← Fᵀ Λ F
 
-for each block, which inverts nothing. It goes from block to block of the filter (3.5 kB each); the samples in between
+for each block, which inverts nothing. It goes from block to block of the filter (2.6 kB each); the samples in between
 take the corrections of both ends in proportion.
 """
 
