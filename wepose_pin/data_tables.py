@@ -155,7 +155,7 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
         elif not series.dtype.is_numeric() and series.dtype != pl.Null:
             raise BadData(f"{holds} values of type {series.dtype}; it must hold numbers")
         numbers = series.cast(pl.Float64)
-        if (too_large := numbers.abs() > LARGEST_NUMBER).any():
+        if (too_large := numbers.fill_nan(None).abs() > LARGEST_NUMBER).any():  # NaN would be the largest
             row = int(too_large.arg_max() or 0)
             raise BadData(f"{holds} {numbers[row]:.3g} in row {row + 1}; no device measures as much")
         columns.append(numbers.fill_null(float("nan")).rename(name))
