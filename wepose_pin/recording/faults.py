@@ -141,6 +141,8 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
             (GYRO, (gyro_S,), of_gyro, STUCK_S),
             (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
+            if not repeats.any():
+                continue
             first, last = np.flatnonzero(np.diff(repeats, prepend=False, append=False)).reshape(-1, 2).T - 1
             length = last - first + 1
             long = (length >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
