@@ -156,8 +156,7 @@ COMMANDS = {
     "simulate": "wepose_pin.commands.simulate:simulate",
     **{name: f"wepose_pin.commands.recordings:{name}" for name in ("calibrate", "track")},
     **{name: f"wepose_pin.commands.results:{name}" for name in ("view", "evaluate", "angles", "export")},
-    **{name: f"wepose_pin.commands.{name}:{name}" for name in ("retarget", "live")},
-    "batch": "wepose_pin.batch.command:batch",
+    **{name: f"wepose_pin.commands.{name}:{name}" for name in ("retarget", "live", "batch")},
 }
 HELP, VERSION = ("--help", "-h"), ("--version", "-V")
 WIDEST = 98  # columns of a help text

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from ..commands.options import Count
-from ..commands.output import Outcome, progress_bar, say
+from .options import Count
+from .output import Outcome, progress_bar, say
 
 
 def batch(
@@ -44,7 +44,7 @@ def batch(
     """
     import polars as pl
 
-    from .study import run_batch
+    from ..batch.study import run_batch
 
     try:
         with progress_bar() as progress:
