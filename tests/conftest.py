@@ -5,12 +5,14 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import re
 import resource
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +84,24 @@ def _compile_in_one_process(dispatcher: Any, signature: Any) -> Any:
 
 
 Dispatcher.compile = _compile_in_one_process
+
+
+# What the core does without ------------------------------------------------------------------------------------------
+
+OPTIONAL = ("daqp", "example-robot-data", "ezc3d", "h5py", "pyarrow", "pylsl", "pyxdf", "rosbags")
+MISSING = [name for name in OPTIONAL if find_spec(name.replace("-", "_")) is None]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    """Skip a test that fails because an optional package is not installed."""
+    try:
+        return (yield)
+    except Exception as error:
+        for name in MISSING:
+            if re.search(f"(install|install --no-deps) {name}|No module named '{name}'", str(error)):
+                pytest.skip(f"{name} is not installed")
+        raise
 
 
 # What the suite costs ------------------------------------------------------------------------------------------------

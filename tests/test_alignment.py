@@ -1,7 +1,5 @@
 """Sensors to segments: mounts and headings from the start pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

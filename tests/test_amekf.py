@@ -1,7 +1,5 @@
 """aMEKF and its smoother: honest covariances, bad data, what smoothing gains, and real recordings."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Joint angles against closed forms through gimbal lock, SciPy on frames from bony landmarks, and drawn errors."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Python interface: what is documented runs, results print, draw, show and save themselves."""
 
-from __future__ import annotations
-
 import doctest
 import inspect
 import json

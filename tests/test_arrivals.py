@@ -1,7 +1,5 @@
 """Samples in the order of arrival → ticks: what is on its tick is kept to the bit, whatever else happens."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -3,8 +3,6 @@
 All of it runs through the command line: exit code 2, one line on stderr, nothing written.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`wepose batch`: each item by itself, whole or not at all, once; on processes here, on a scheduler, below a URL."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

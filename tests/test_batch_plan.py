@@ -1,7 +1,5 @@
 """`PLAN.toml`: what it may say, whose sessions are whose, and what is said of mistakes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import polars as pl

@@ -1,7 +1,5 @@
 """`python -m benchmarks`: tables have the rows they should; bodies beside what is known of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

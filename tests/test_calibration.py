@@ -1,7 +1,5 @@
 """Closed-chain calibration: the physics of the scale, honest deviations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

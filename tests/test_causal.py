@@ -1,7 +1,5 @@
 """Tracking without a look ahead: steps and runs give the same bits, and nothing later changes what was said."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mechanisms: a made-up arm whose truth is known, and a UR5 beside its encoders."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

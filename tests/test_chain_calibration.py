@@ -1,7 +1,5 @@
 """A simulated UR5 with a sensor on each link, its tip on points: two lengths are calibrated."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

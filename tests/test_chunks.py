@@ -1,7 +1,5 @@
 """Long recordings: in chunks they give what they give as a whole, bit-identical."""
 
-from __future__ import annotations
-
 import json
 import os
 import weakref

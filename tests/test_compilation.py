@@ -1,7 +1,5 @@
 """Kernels are compiled once and kept."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -9,6 +9,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import numpy as np
+import pytest
 
 import wepose_pin as wp
 from wepose_pin.writers import write_session
@@ -26,6 +27,7 @@ for line in {lines!r}:
 
 def run(folder: Path, *lines: str) -> str:
     """What commands print, in a process in which the example is installed."""
+    pytest.importorskip("setuptools", minversion="77")
     shutil.copytree(EXAMPLE, folder / "source")
     build = [sys.executable, "-c", "from setuptools.build_meta import build_wheel; build_wheel('..')"]
     subprocess.run(build, cwd=folder / "source", capture_output=True, check=True)
