@@ -167,6 +167,16 @@ def test_who_moves_in_the_start_pose_is_told_which_sensor_moved(tmp_path: Path) 
     session.guide.close()
 
 
+def test_a_start_pose_that_the_calibration_would_refuse_is_asked_for_again(tmp_path: Path) -> None:
+    """A sway of 7.5 deg/s from side to side, which nowhere stands still for a second."""
+    session = Session(tmp_path)
+    sway = lambda: np.deg2rad(7.5) * np.sin(2.0 * np.pi * 0.8 * session.source.clock())  # noqa: E731
+    session.person.disturb = lambda segment, gyro: gyro + sway() * (segment == "torso") * np.eye(3)[2]
+    moment = session.run(lambda m: "swayed" in m.view.note or m.step == "clasp")[-1]
+    assert (moment.step, moment.view.note) == ("start", "You swayed too much. Once more: 4 s still.")
+    session.guide.close()
+
+
 def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     session = Session(tmp_path)
     session.source.accel_scale = 1.0 / 9.80665

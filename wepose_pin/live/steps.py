@@ -14,7 +14,8 @@ from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step
 from ..calibration.result import format_longest
 from ..diagnostics import join_text, render, render_all
-from ..errors import BadData, BadOption, ExistingOutput, WeposeError
+from ..errors import BadData, BadOption, BadPhase, ExistingOutput, WeposeError
+from ..filters.phases import find_reference_phases
 from ..recording.arrivals import unpack_orientations
 from ..tracking.start_pose import StartPoseDetector
 from .guide import STATURE, Guide, GuideOptions, GuideStep, StepRun
@@ -189,6 +190,10 @@ def hold_start_pose(guide: Guide, _: bool) -> StepRun:
                     try:
                         static = replace(attempt.make_recording(), phases={"static": ((first, last),)})
                         check_units(static.check())
+                        find_reference_phases(replace(static, phases={"start": ((first, last),)}), sways=True)
+                    except BadPhase:  # by which the calibration would refuse it in the end
+                        reason = f"You swayed too much. Once more: {seconds:.0f} s still."
+                        break
                     except BadData as error:
                         reason = str(error)
                         break
