@@ -52,26 +52,6 @@ def measure_exactly(recording: Recording, simulation: Simulation) -> dict[str, O
 
 
 @pytest.mark.parametrize("causal", [False, True])
-def test_exact_measured_orientations_are_used_as_they_are(
-    half_minute: Recording, simulation: Simulation, person: Person, causal: bool
-) -> None:
-    """What joined hands show of their headings is less than its own uncertainty; a heading that drifts is corrected."""
-    sensors, segment = measure_exactly(half_minute, simulation), "left_forearm"
-    drift = Rotation.from_euler("z", np.interp(half_minute.time, [5.0, 30.0], [0.0, 50.0])[:, None], degrees=True)
-    drifting = (drift * Rotation.from_quat(sensors[segment].quat_VS)).as_quat()
-    off = {**sensors, segment: replace(sensors[segment], quat_VS=drifting)}
-    subject, change = replace(population_subject(), lengths=person.lengths), {}
-    for name, each in (("exact", sensors), ("drifting", off)):
-        recording = replace(half_minute, sensors=each)
-        corrected, as_measured = (
-            track(recording, subject, causal=causal, open_loop=open_loop) for open_loop in (False, True)
-        )
-        change[name] = max(np.abs(corrected.quat_WL[s] - as_measured.quat_WL[s]).max() for s in corrected.quat_WL)
-    assert change["exact"] == 0.0
-    assert change["drifting"] > 0.05
-
-
-@pytest.mark.parametrize("causal", [False, True])
 def test_the_uncertainty_of_measured_orientations_grows_in_gaps(
     half_minute: Recording, simulation: Simulation, causal: bool
 ) -> None:

@@ -107,7 +107,6 @@ class HeadingCorrector:
         self._clasped = np.zeros(self._size, dtype=bool)
         self._from, self._to, self._at_reset = np.zeros((3, k))
         self._start_cov = self.filter.start_cov
-        self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot
         self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
         self._filtered: list[np.ndarray] = []  # as of `HeadingCorrection`
@@ -159,10 +158,7 @@ class HeadingCorrector:
                 self._times.append(end - 0.5 * last / self.filter.sensor_rate_hz)
             return
         errors, covariance, segment_covariance = self._estimate()
-        self._from, self._to, measured = self._to, errors.copy(), self.filter.measured
-        if measured.any() and not self._corrects_measured:
-            self._corrects_measured = exceed_uncertainty(self._to[None], covariance[None])
-            self._to[measured] *= self._corrects_measured
+        self._from, self._to = self._to, errors
         if end is not None:
             self._history.append((self._to, covariance, segment_covariance))
             self._times.append(end)
@@ -192,7 +188,6 @@ class HeadingCorrector:
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._to - error) / (2.0 * np.pi))
         self.filter.reset(error, again=True)
-        self._corrects_measured = True
         self._from = self._to = self._at_reset = error
         self._set_variance(self._estimate()[2])
 
@@ -217,7 +212,7 @@ class HeadingCorrector:
 
         None: there is no knot.
         """
-        forward, measured = self.filter, self.filter.measured
+        forward = self.filter
         if self._count:
             self.close(filters, end)
         if not self._times:
@@ -233,10 +228,7 @@ class HeadingCorrector:
             P = symmetric(before_P + gain @ (P - forward.P) @ gain.T)
             estimates.append(forward.estimate(x, P))
             process = process_before
-        smoothed = self.collect(estimates[::-1])
-        if measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
-            smoothed.errors[:, measured] = 0.0
-        return smoothed
+        return self.collect(estimates[::-1])
 
     def _read_state(self, knot: int) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Return x, P and `HeadingFilter.process` of a knot."""
@@ -245,13 +237,3 @@ class HeadingCorrector:
         self._states.seek(8 * ends[-1] * knot)
         x, P, change, variance, turn = np.split(np.frombuffer(self._states.read(8 * ends[-1])), ends[:-1])
         return x, P.reshape(n, n), (change, variance, turn)
-
-
-def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
-    """Return whether a combination of corrections exceeds its own standard deviation, at one of the knots.
-
-    Otherwise measured orientations are used as they are: what corrects them is less than what is not known. `errors`
-    are (m, k) [rad] and `covariance` (m, k, k) [rad²] of all headings at the knots.
-    """
-    weighted = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
-    return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
