@@ -77,7 +77,6 @@ MOUNTS_S = 120.0  # [s] after the start pose whose accelerations show a turned m
 # A heading may be feigned by no more than a share of the rms misfit; found by simulated people who walk, run, throw and
 # reach.
 LARGEST_COHERENT_SHARE = 0.5
-_HINGE_COLUMNS = [0, 1, 2, 2, 3]  # of a hinge's H: soft tissue twists a sensor about the same axis as the hinge's
 # Jacobian of the angle and of the two sides of a joint by its columns (`HeadingFilter._pair_columns`).
 _JOINT_JACOBIAN = np.zeros((15, 17))
 _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
@@ -93,14 +92,14 @@ JOINT_STD, JOINT_CORRELATION_S = np.deg2rad(0.5), 60.0
 ACCELERATION_STD, ACCELERATION_CORRELATION_S = 0.07, 0.4
 # [m/s²] fixed in the sensor's frame: the tilt error of an orientation filter in motion, a degree, times gravity.
 FORCE_STD, FORCE_CORRELATION_S = np.deg2rad(1.0) * 9.81, 20.0
-TWIST_CORRELATION_S, HINGE_CORRELATION_S, CLOSURE_CORRELATION_S = 4.0, 5.0, 20.0
+HINGE_CORRELATION_S, CLOSURE_CORRELATION_S = 5.0, 20.0
 # [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
 AXIS_STD, TILT_STD = float(np.deg2rad(5.0)), float(np.deg2rad(2.0))
 RANGE_STD = np.deg2rad(10.0)  # [rad] of the limits of a hinge's range
 # Those of a person and of a mechanism, in this order: [rad/s] at which a heading drifts, apart from its gyroscope's
-# bias; [rad] of the heading by the acceleration of a joint that travels, as a shoulder; [rad] of a sensor about its
-# segment's long axis by soft tissue; [rad] of other errors between a hinge's plane and the segment below.
-RATE_STD, GIRDLE_STD, TWIST_STD, HINGE_STD = np.deg2rad([[0.05, 0.2], [0.9, 0.5], [7.0, 0.5], [4.0, 0.5]])
+# bias; [rad] of the heading by the acceleration of a joint that travels, as a shoulder; [rad] between a hinge's plane
+# and the segment below: a person's soft tissue turns the sensor above by 7 deg about its segment, all else is 4 deg.
+RATE_STD, GIRDLE_STD, HINGE_STD = np.deg2rad([[0.05, 0.2], [0.9, 0.5], [8.0, 0.7]])
 
 
 class HeadingFilter:
@@ -146,7 +145,6 @@ class HeadingFilter:
         kind, start_pose = int(model.table.is_mechanism), StartPose(model.neutral_rotations)
         self._rate_var = RATE_STD[kind] ** 2
         raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
-        self.measured = np.array([name not in raw for name in self.names])
         self.pairs, levers, lever_std, travels = find_joint_pairs(model, raw if first.rate_hz >= LEAST_RATE_HZ else {})
         # Hinges between two sensors; standard deviations [rad] of the axis about the long axis of the segment above and
         # across, and of the angle between the hinge's plane and the segment below.
@@ -202,10 +200,9 @@ class HeadingFilter:
         if not first.remounted:
             self.mount_cov += subject.lengths_covariance([f"mounts.{name}.z" for name in self.names])
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
-        h, always, known = len(self.hinges), np.inf, np.sqrt(start[3])
+        always, known = np.inf, np.sqrt(start[3])
         rate_std = np.hypot(RATE_STD[kind], np.where(np.isfinite(known), known, rate_std))
         joint_std = np.where(travels, GIRDLE_STD[kind], JOINT_STD)
-        twist_std, force_std = np.full(h, TWIST_STD[kind]), np.full((k, 3), FORCE_STD)
         delay_std = np.full(k, AVERAGED_SAMPLES / first.rate_hz + CHIP_DELAY_STD)
         states = {
             "heading": (np.zeros(k), always),  # δ [rad]
@@ -213,10 +210,9 @@ class HeadingFilter:
             "scale": (np.full(k, SCALE_STD), always),  # of a gyroscope
             "joint": (joint_std, JOINT_CORRELATION_S),  # [rad] of the heading by a joint's acceleration
             "axis": (axis_stds, always),  # [rad] of a hinge about the long axis of the segment above
-            "twist": (twist_std, TWIST_CORRELATION_S),  # [rad] of that segment's sensor, the same
             "tilt": (tilt_stds, always),  # [rad] of a hinge about the direction across
             "mount": (np.zeros(k), always),  # [rad] of a mount's heading
-            "force": (force_std, FORCE_CORRELATION_S),  # [m/s²] fixed in the sensor's frame
+            "force": (np.full((k, 3), FORCE_STD), FORCE_CORRELATION_S),  # [m/s²] fixed in the sensor's frame
             "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
             "lever": (np.tile(lever_std[:, None], 6), always),  # [m] of the near and the far sensor from the joint
         }
@@ -237,8 +233,8 @@ class HeadingFilter:
             near, far, lever = index(pair[0]), index(pair[1]), c["lever"][i]
             sides = [(*own, *c["force"][at], c["delay"][at]) for own, at in ((lever[:3], near), (lever[3:], far))]
             self._pair_columns.append(np.array([near, far, c["joint"][i], *sides[0], *sides[1]]))
-        self._hinge_columns = [  # (5,) each: headings of the segments below and above, axis, twist, tilt
-            np.array([index(hinge.moves), index(hinge.on), *(c[name][i] for name in ("axis", "twist", "tilt"))])
+        self._hinge_columns = [  # (4,) each: headings of the segments below and above, axis, tilt
+            np.array([index(hinge.moves), index(hinge.on), c["axis"][i], c["tilt"][i]])
             for i, hinge in enumerate(self.hinges)
         ]
         self._shape_cov = subject.shape_covariance(model.table)
@@ -412,7 +408,6 @@ class HeadingFilter:
             if unreliable[on] or unreliable[moves]:
                 continue
             r, H, excess, slope = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], x[columns[:2]])
-            H = H[:, _HINGE_COLUMNS]
             r = r + H[:, 2:] @ x[columns[2:]]
             is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
             self._add(columns, H, r, is_inlier / (std**2 * samples))
@@ -519,7 +514,7 @@ class HeadingFilter:
             headings[:, :, 0 if i == moves else 1] += turns
             quat_on, quat_moves = (np.repeat(quat_WL[:, at], g, axis=0) for at in (on, moves))
             r, H, excess, _ = linearize_hinge(hinge, quat_on, quat_moves, headings.reshape(-1, 2))
-            by_other, H = H[:, 0 if other == moves else 1], H[:, _HINGE_COLUMNS[2:]]
+            by_other, H = H[:, 0 if other == moves else 1], H[:, 2:]
             r = r + H @ x[columns[2:]]
             r_var = std**2 + var[other] * by_other**2 + np.sum(H @ self.P[np.ix_(columns[2:], columns[2:])] * H, axis=1)
             misfit = np.log1p(r**2 / (TAIL * r_var)) + np.log1p(excess**2 / (TAIL * RANGE_STD**2))
