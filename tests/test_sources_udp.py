@@ -15,7 +15,7 @@ import pytest
 from bodies import SEGMENTS
 from sampling import collect, connected, find_free_port
 
-from wepose_pin import BadSource
+from wepose_pin import BadData, BadSource
 from wepose_pin.live.sources import open_source
 from wepose_pin.live.sources.udp import UdpSource
 
@@ -132,6 +132,22 @@ def test_two_senders_with_clocks_of_their_own(source: UdpSource, sender: socket.
             time.sleep(0.01)
         samples = collect(source, 20, sensors=2)
     assert np.abs(samples["torso"].time - samples["head"].time).max() < 0.02
+
+
+def test_times_in_another_unit_are_refused_and_those_of_one_sender_are_counted() -> None:
+    """A clock that is set by eleven days while it runs is in seconds all the same."""
+
+    def take(*scales: float) -> dict[str, int]:
+        source = UdpSource("127.0.0.1", 0, SEGMENTS, SEGMENTS)
+        for now in np.arange(0.0, 5.0, 0.05):
+            lines = [GOOD | {"t": now * scale + 1e6 * (now > 2.5)} for scale in scales]
+            source.take([(json.dumps(line).encode(), sender) for sender, line in enumerate(lines)], now)
+        return source.problems
+
+    assert take(1.0) == {}
+    assert "samples whose t grows 1000 times faster than this machine's clock; seconds" in str(take(1.0, 1e3))
+    with pytest.raises(BadData, match="t grows 1000000 times faster than this machine's clock; seconds are needed"):
+        take(1e6, 1e6)
 
 
 def test_a_sensor_that_is_not_tracked_is_counted(sender: socket.socket) -> None:

@@ -27,6 +27,7 @@ IMPLAUSIBLE = "samples with values that no body sensor gives"
 # Of `HostClock`: minima over BUCKET_S are kept for WINDOW_S; the offset follows with SETTLE_S, MAX_SLEW at most.
 BUCKET_S, WINDOW_S, SETTLE_S, MAX_SLEW = 1.0, 10.0, 2.0, 0.01
 JUMP_S = 0.05  # [s] by which a sample is faster than all before: the sender's clock was set, or the first came late
+SPEED_S = 1.0  # [s] over which the speed of the sender's clock is measured
 BACK_S = 1.0  # [s] by which time goes back: the sender has restarted. Less: a datagram was overtaken
 
 
@@ -164,15 +165,23 @@ class HostClock:
     A sample's arrival minus its time is the clocks' offset plus its delay, and a delay is never negative: the smallest
     of the last ten seconds is the best estimate of the offset (the minimum filter of NTP, RFC 5905, section 10). The
     applied offset follows that estimate smoothly, so that regular samples stay regular.
+
+    `speed` is that of the sender's clock relative to ours, the lower one of the last two spans of `SPEED_S`: a clock
+    that was set is fast in only one of them.
     """
 
     def __init__(self) -> None:
         self._buckets: deque[tuple[float, float]] = deque()  # (begin [s] of arrival, smallest arrival − time [s])
         self._newest, self._offset = -math.inf, 0.0
+        self.speed = self._last_speed = 0.0
+        self._span = -math.inf, 0.0  # [s] arrival and time of the sample with which it began
 
     def to_host(self, time: np.ndarray, arrival: float) -> np.ndarray:
         """Times (m,) [s] on our clock of samples that came together, at `arrival` [s] on it."""
         newest, buckets = float(time.max()), self._buckets
+        if arrival - self._span[0] > SPEED_S:
+            speed = (newest - self._span[1]) / (arrival - self._span[0])
+            self.speed, self._last_speed, self._span = min(speed, self._last_speed), speed, (arrival, newest)
         delay = arrival - newest  # with the offset
         if newest < self._newest - BACK_S or delay < self._offset - JUMP_S or not math.isfinite(self._newest):
             buckets.clear()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import BadOption, BadSource, one_of
+from ...errors import BadData, BadOption, BadSource, one_of
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 from ...recording.arrivals import Samples
 from . import MAX_TIME, HostClock, Source, SourceKind, SourceOptions
@@ -22,6 +22,7 @@ LOOPBACK = "127.0.0.1"
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
 BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
 COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
+MAX_SPEED = 20.0  # of a sender's clock relative to ours; above it, the sender's times are not in seconds
 MAX_SENSORS = 64  # of any name
 MAX_CLOCKS = 64  # of senders; one that opens a new socket for each datagram has many
 LONGEST_NAME = 24  # letters
@@ -171,7 +172,8 @@ def open_spec(rest: str, options: SourceOptions) -> UdpSource:
 class UdpSource(DatagramSource):
     """Samples of raw sensors, in `units` where a line states none; other parameters and errors as `DatagramSource`.
 
-    Times of each sender, an address and port, are mapped to our clock (`HostClock`).
+    Times of each sender, an address and port, are mapped to our clock (`HostClock`). Reading raises `BadData` when no
+    sender's times are in seconds; if only some are not, their samples are dropped and counted.
     """
 
     kind, sender = "udp", "samples"
@@ -204,6 +206,13 @@ class UdpSource(DatagramSource):
                 self._clocks.clear()
             clock = self._clocks.setdefault(sender, HostClock())
             times = clock.to_host(np.concatenate([each.time for each in own]), now)
+            if clock.speed > MAX_SPEED:
+                factor = float(f"{clock.speed:.1g}")
+                problem = f"t grows {factor:.0f} times faster than this machine's clock; seconds are needed"
+                if all(each.speed > MAX_SPEED for each in self._clocks.values()):
+                    raise BadData(f"udp:{self.address[0]}:{self.address[1]}: {problem}")
+                self.count(f"samples whose {problem}", len(times))
+                continue
             for each in own:
                 sound += self.keep_plausible(each._replace(time=times[: len(each.time)]))
                 times = times[len(each.time) :]
