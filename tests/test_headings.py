@@ -306,6 +306,23 @@ def test_a_sensor_that_is_lost_while_the_person_turns_is_found_again(
 
 
 @pytest.mark.parametrize("causal", [False, True])
+def test_after_a_loss_of_all_sensors_that_follows_one_of_a_single_one_there_are_poses(
+    moving: Simulation, causal: bool
+) -> None:
+    recording, sensors = moving.recording(), dict[str, ImuSensor]()
+    time = recording.time
+    for name, sensor in recording.imus.items():
+        own = (time > 30.0) & (time < 33.0) & (name == "right_forearm")
+        sensors[name] = replace(sensor, gap=own | ((time > 36.0) & (time < 38.0)))
+    phases = {"start": recording.phases["start"]}
+    tracked = track(replace(recording, sensors=sensors, phases=phases), causal=causal)
+    truth = np.searchsorted(moving.time, tracked.time - 1e-9)
+    for name, quat in tracked.quat_WL.items():
+        error = Rotation.from_quat(moving.quat_WL[name][truth]) * Rotation.from_quat(quat).inv()
+        assert np.all(np.abs(heading(error.as_quat())) < 3.0 * np.sqrt(tracked.pose.segment_cov[name][:, 2, 2]))
+
+
+@pytest.mark.parametrize("causal", [False, True])
 def test_arms_that_hang_still_stay_as_the_filter_has_them(moving: Simulation, causal: bool) -> None:
     rng = np.random.default_rng(1)
     n = 4000

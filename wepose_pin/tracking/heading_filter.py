@@ -432,6 +432,7 @@ class HeadingFilter:
         best = int(np.lexsort((np.diag(self.P)[: len(leaps)], -is_narrow.sum(axis=1)))[0])  # known to most others
         begins = leaps & ~is_narrow[best]
         searched = begins | self._searched
+        searched[best] = False  # even if it was: after a loss of all sensors the others are relative to it
         order, relative_to = np.flatnonzero(~searched).tolist(), np.full(len(leaps), best)
         joined = [(near, far) for near, far, *_ in (*self._pair_columns, *self._hinge_columns)]
         for known in order if searched.any() else ():
