@@ -273,6 +273,16 @@ def test_sensors_with_clocks_of_their_own_come_to_one_time(own_rate: float, sens
     assert "With `rate_hz`, the start of each sensor is lost" in str(resampled)
 
 
+def test_a_sensor_that_ends_early_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path, table_at(np.arange(1000) / 100.0), head=table_at(np.arange(600) / 100.0))
+    recording = load_session(path)
+    (short,) = (each for each in recording.diagnostics if each.severity == "warning")
+    assert (short.code, short.place, short.value) == ("sensor-short", "head", pytest.approx(4.0))
+    path.write_text(path.read_text(encoding="utf-8").replace("[[0.5, 1.9]]", "[[7, 9]]"), encoding="utf-8")
+    with pytest.raises(BadPhase, match=r"outside the recording.* The head sensor measured from 0 s to 5.99 s only"):
+        load_session(path)
+
+
 def test_a_faster_sensor_is_averaged_so_that_its_noise_does_not_fold_down(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     fast, slow = (

@@ -15,9 +15,9 @@ import polars as pl
 from ..arguments import check_arguments
 from ..body.table import NEUTRAL_POSE
 from ..data_tables import read_columns, read_table, read_times
-from ..diagnostics import INFO, WARNING, Diagnostic
+from ..diagnostics import INFO, WARNING, Diagnostic, render
 from ..documents import Finite, Key, TomlTable, format_value, is_number, read_record, read_toml, toml_key
-from ..errors import BadData, BadSession, MissingFile, one_of, printable
+from ..errors import BadData, BadPhase, BadSession, MissingFile, one_of, printable
 from ..recording import CONFIGURATION, ImuSensor, OrientationSensor, Recording, Sensor, clocks, compute_mount, read_axes
 from ..recording.clocks import TIME_UNITS, Clock
 from ..recording.faults import Fault, check_sensors
@@ -258,7 +258,11 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         diagnostics.append(Diagnostic("time-stamps-uneven", INFO, file, facts=facts))
     del contents  # of a day its tables are gigabytes
     time, resampled = clocks.find_common_time(str(path), own_clocks)
-    check_phases(str(path), time, head.phases)
+    try:
+        check_phases(str(path), time, head.phases)
+    except BadPhase as error:
+        short = [render(each)["what"] for each in resampled if each.code == "sensor-short"]
+        raise BadPhase(" ".join((f"{error}{'.' * bool(short)}", *short))) from None
     start = next(iter(head.phases.get("start", ())), None)
     samples = {name: (clock.time[clock.row >= 0], *rows[name].values()) for name, clock in own_clocks.items()}
     faults, gyro_range, frozen = check_sensors(str(path), samples, start)

@@ -12,13 +12,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from .. import rotations
-from ..diagnostics import INFO, Diagnostic
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData
 from . import OrientationSensor, Sensor
 from .intervals import check_time, find_runs, format_span
 from .limits import LONGEST_STEP_S, SHORTEST_STEP_S
 
 LONGEST_GAP_S = 0.05  # [s] of lost samples that are bridged silently
+MOST_MISSING_S = 2.0  # by which a sensor may begin later and end earlier than others without a warning
 # Relative deviation of a step from the usual one that means an uneven clock or a lost row; devices jitter less.
 UNEVEN = 0.5
 # Relative deviation of the rate over 1 s or 10 s from its mean, apart from one sample's jitter, at which the rate is
@@ -155,7 +156,14 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     facts |= {"shortest": min(float(each.min()) for each in steps), "longest": max(float(each.max()) for each in steps)}
     variant, off = ("uneven", uneven) if uneven > UNEVEN else ("changing", drift)
     facts["variant"] = variant if shared else "clocks"
-    return time, (Diagnostic("time-stamps-uneven", INFO, value=off if shared else None, facts=facts),)
+    found = [Diagnostic("time-stamps-uneven", INFO, value=off if shared else None, facts=facts)]
+    earliest, latest = min(clock.time[0] for clock in distinct), max(clock.time[-1] for clock in distinct)
+    for name, clock in clocks.items():
+        own: dict[str, float | str] = {"start": float(clock.time[0]), "end": float(clock.time[-1])}
+        missing_s = float((clock.time[0] - earliest) + (latest - clock.time[-1]))
+        if missing_s > MOST_MISSING_S:
+            found.append(Diagnostic("sensor-short", WARNING, name, missing_s, facts=own))
+    return time, tuple(found)
 
 
 def _compute_drift(time: np.ndarray) -> float:
