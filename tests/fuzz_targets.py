@@ -300,7 +300,7 @@ TARGETS = (
     Target(
         "retarget",
         lambda: [arm()["arm.urdf"]],
-        file("arm.urdf", lambda path: CollisionModel(retargeting.load_robot(retargeting.find_map(str(path)))), arm),
+        file("arm.urdf", lambda path: CollisionModel(retargeting.load_robot(str(path))), arm),
     ),
     Target("datagram", datagrams, receive),
     Target("live_log", lambda: [live_log()], file("a.mcap", wp.load_session)),

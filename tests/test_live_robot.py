@@ -41,7 +41,7 @@ APPROACH_SPEED = 0.25  # [m/s] of a hand, as docs/live-outputs.md has it
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> retargeting.Robot:
-    return retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+    return retargeting.load_robot(str(write_arm(tmp_path_factory.mktemp("arm"))))
 
 
 def live_poses(pose: wp.Pose, std: float = 0.005) -> list[LivePose]:
@@ -402,7 +402,7 @@ def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, r
     wait_until(receiver.has_ended)
     assert receiver.messages[-1]["reason"] == "the session has ended"
     assert "arm: " in out
-    keeps_its_limits(receiver.messages, retargeting.load_robot(retargeting.find_map(str(urdf))))
+    keeps_its_limits(receiver.messages, retargeting.load_robot(str(urdf)))
 
 
 def test_wrong_robots_are_one_line_before_the_source_opens(

@@ -21,7 +21,7 @@ pytest.importorskip("daqp")
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory):
-    return retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+    return retargeting.load_robot(str(write_arm(tmp_path_factory.mktemp("arm"))))
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_a_motion_leaves_the_margins_that_are_asked_for(arm, swung: retargeting.
     stated = "[limits.position]\nelbow = [-1.5, -0.7]\n[limits.velocity]\nelbow = 0.8\n[arms.right]"
     said = urdf.with_suffix(".toml").read_text().replace("[arms.right]", stated)
     urdf.with_suffix(".toml").write_text(said)
-    narrow = retargeting.load_robot(retargeting.find_map(str(urdf)), speed_scale=0.5, limit_margin=0.1)
+    narrow = retargeting.load_robot(str(urdf), speed_scale=0.5, limit_margin=0.1)
     trajectory = retargeting.retarget(person(3.0), narrow)
     is_sound(trajectory)
     elbow = JOINTS.index("elbow")
@@ -231,7 +231,7 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
 
 
 def test_too_fast_is_slowed(tmp_path: Path) -> None:
-    slow = retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path, acceleration=2.0))))
+    slow = retargeting.load_robot(str(write_arm(tmp_path, acceleration=2.0)))
     pose = person(4.0, swing=45.0)
     trajectory = retargeting.retarget(pose, slow)
     is_sound(trajectory)

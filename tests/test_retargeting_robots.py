@@ -22,7 +22,7 @@ pytestmark = [
 
 @pytest.mark.parametrize("name", retargeting.ROBOTS)
 def test_every_robot_follows_and_keeps_its_limits(name: str) -> None:
-    robot = retargeting.load_robot(retargeting.find_map(name))
+    robot = retargeting.load_robot(name)
     right, left = person(4.0), person(4.0, side="left", swing=15.0)
     both = replace(right, quat_WL=right.quat_WL | left.quat_WL, points=right.points | left.points)
     trajectory = retargeting.retarget(both, robot)

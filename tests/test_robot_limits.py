@@ -20,7 +20,7 @@ pytest.importorskip("daqp")
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> retargeting.Robot:
-    return retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+    return retargeting.load_robot(str(write_arm(tmp_path_factory.mktemp("arm"))))
 
 
 def ridden(share, dt: float, seconds: float, n: int = 60):
@@ -134,7 +134,7 @@ def test_nothing_of_a_robot_on_a_table_goes_below_it(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     said = urdf.with_suffix(".toml").read_text()
     urdf.with_suffix(".toml").write_text(said.replace('forward = "+x"', 'forward = "+x"\ntable = -0.6'))
-    robot = retargeting.load_robot(retargeting.find_map(str(urdf)))
+    robot = retargeting.load_robot(str(urdf))
     with pytest.raises(errors.WeposeError, match="rest, table: forearm_0 is in the table in the rest posture"):
         retargeting.retarget(person(2.0), retargeting.load_robot(robot.map._replace(table=-0.4)))
     pose = person(4.0, flexion=15.0)  # the hand hangs 0.6 m below the shoulder

@@ -20,7 +20,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> retargeting.Robot:
 
 
 def load(urdf: Path) -> retargeting.Robot:
-    return retargeting.load_robot(retargeting.find_map(str(urdf)))
+    return retargeting.load_robot(str(urdf))
 
 
 @pytest.mark.parametrize(
@@ -67,6 +67,7 @@ def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, 
             r"limits.position.yaw = \[1, -1\]; the first must be smaller",
         ),
         ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; a number above 0"),
+        ("hand = {", "reach = 3.0\nhand = {", r"arms.right.reach = 3: the joints allow 0\.\d\d m at most"),
         ("[rest]", "[rest", "not valid TOML"),
     ],
 )
@@ -117,7 +118,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(errors.WeposeError, match="`robot` pandas: not known; did you mean 'panda'"):
         retargeting.find_map("pandas")
     with pytest.raises(errors.WeposeError, match=r"`arm` left: arm has no left arm; there is: right"):
-        retargeting.load_robot(retargeting.find_map(str(urdf)), ("left",))
+        retargeting.load_robot(str(urdf), ("left",))
     urdf.with_suffix(".toml").unlink()
     with pytest.raises(errors.WeposeError, match=r"no arm.toml beside it; a robot needs a map"):
         retargeting.find_map(str(urdf))

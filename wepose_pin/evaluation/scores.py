@@ -111,8 +111,8 @@ def evaluate(
     pose : TrackResult or Pose
         What `track` or `load_result` gives, or its `pose`.
     truth : TrackResult or Pose, str or Path
-        The reference, or a table (.parquet, .csv) with the columns of pose.parquet; where it is
-        NaN, or has no sample near a time of the pose, that time is left out.
+        The reference, or a table (.parquet, .csv) with the columns of pose.parquet, such as `load_session(…).truth`;
+        where it is NaN, or has no sample near a time of the pose, that time is left out.
     interval : (float, float), optional
         Use only this time of the recording, from and to in seconds.
     table : BodyTable, optional

@@ -20,7 +20,7 @@ from ..body.subject import Subject, population_subject
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import Finite, TomlTable, read_toml
 from ..errors import BadOption, WrongOption
-from ..retargeting import Robot, find_map, load_robot
+from ..retargeting import Robot, load_robot
 from ..retargeting.maps import list_sides
 from ..retargeting.stream import ArmObserver, Command, CommandStream
 from ..retargeting.targets import check_person_arms
@@ -313,7 +313,7 @@ def read_robot(name: str) -> tuple[CommandStream, str]:
     file = Path(name)
     values = read_toml(file, "a robot", BadOption) if file.suffix == ".toml" and file.is_file() else {}
     if "robot" not in values:
-        return CommandStream(load_robot(find_map(name))), str(ROBOT_PORT)
+        return CommandStream(load_robot(name)), str(ROBOT_PORT)
     keys = TomlTable(values, name, error=BadOption)
     keys.allow("robot", "arm", "to", *MARGINS, *TIMING)
     robot = str(keys.text("robot", None))
@@ -323,7 +323,7 @@ def read_robot(name: str) -> tuple[CommandStream, str]:
     )
     sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
     try:
-        chosen = load_robot(find_map(str(neighbour) if neighbour.is_file() else robot), sides, **margins)
+        chosen = load_robot(str(neighbour) if neighbour.is_file() else robot, sides, **margins)
         return CommandStream(chosen, **timing), str(values.get("to", ROBOT_PORT))
     except WrongOption as error:
         raise BadOption(f"{name}: {error.name} = {error.value}: {error.needed}") from None

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from ..body.urdf import package_folders
 from ..errors import BadModel, WrongOption, native_stderr_muted, one_of, reason
 from ..recording import AXES
-from .maps import ArmMap, HandPoint, JointLimit, LinkPoint, RobotMap
+from .maps import ArmMap, HandPoint, JointLimit, LinkPoint, RobotMap, find_map
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
 MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
@@ -74,9 +74,11 @@ class Robot:
 
 
 def load_robot(
-    robot: RobotMap, sides: tuple[str, ...] | None = None, speed_scale: float = 0.9, limit_margin: float = 0.05
+    robot: RobotMap | str, sides: tuple[str, ...] | None = None, speed_scale: float = 0.9, limit_margin: float = 0.05
 ) -> Robot:
-    """Build the robot of a map, with the arms of `sides`, None: all; the other parameters are those of `retarget`.
+    """Build the robot of a map, or of a name as of `find_map`, with the arms of `sides`, None: all.
+
+    The other parameters are those of `retarget`.
 
     Raises
     ------
@@ -88,6 +90,7 @@ def load_robot(
         raise WrongOption("speed_scale", f"{speed_scale:g}", "above 0, up to 1, the robot's full limits")
     if not 0.0 <= limit_margin < np.pi:
         raise WrongOption("limit_margin", f"{limit_margin:g}", "radians, at least 0, are needed")
+    robot = robot if isinstance(robot, RobotMap) else find_map(robot)
     for side in sides or ():
         if side not in robot.arms:
             raise WrongOption("arm", side, f"{robot.name} has no {side} arm; {one_of(robot.arms)}")
@@ -210,7 +213,10 @@ def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
     p_shoulder = data.oMf[shoulder].translation.copy()
     if any(name in robot.map.rest for name in arm.joints):
         _check_rest(robot, side, robot.R_BT.T @ (data.oMf[hand].translation - p_shoulder))
-    return Arm(side, joints, p_shoulder, hand, elbow, _find_reach(robot, joints, p_shoulder, hand))
+    reach = _find_reach(robot, joints, p_shoulder, hand)
+    if (arm.reach or 0.0) > reach:
+        raise BadModel(f"{robot.map.where}: arms.{side}.reach = {arm.reach:g}: the joints allow {reach:.2f} m at most")
+    return Arm(side, joints, p_shoulder, hand, elbow, reach)
 
 
 def _build_rotation(x: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ from ..writers.motion import JointMotion
 from .collision import CollisionModel
 from .controller import ControllerParams, JointState, QpController, StepReport
 from .limits import MAX_STOP_S
-from .maps import find_map, list_sides
+from .maps import list_sides
 from .robot import Robot, load_robot
 from .targets import SMOOTHING_HZ, ArmTargets, HandTarget, compute_arm_targets, compute_swivel
 from .visuals import place_root
@@ -184,10 +184,10 @@ def retarget(
     stated = {"speed_scale": speed_scale, "limit_margin": limit_margin}
     margins = {name: value for name, value in stated.items() if value is not None}
     if not isinstance(robot, Robot):
-        robot = load_robot(find_map(str(robot)), list_sides(arm), **margins)
+        robot = load_robot(str(robot), list_sides(arm), **margins)
     elif arm is not None or margins:
         raise BadOption(
-            "arm, speed_scale, limit_margin: a Robot has arms and margins of its own; give `wp.load_robot` them"
+            "arm, speed_scale, limit_margin: a Robot has arms and margins of its own; give `load_robot` them"
         )
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
