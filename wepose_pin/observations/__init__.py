@@ -391,7 +391,7 @@ def find_neighbours(model: BodyModel, sensors: Collection[str]) -> list[tuple[st
 
 def find_joint_pairs(
     model: BodyModel, quat_LS: Mapping[str, np.ndarray]
-) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[list[tuple[str, str]], np.ndarray, np.ndarray]:
     """Find the joints between two sensors, by the mounts (4,) xyzw of all sensors.
 
     Returns
@@ -399,7 +399,6 @@ def find_joint_pairs(
     pairs : p pairs of segments with the sensors, the one nearer the root first
     levers : (p, 6) [m] usual ones from the joint to the near sensor and to the far one, each in its own S
     lever_std : (p,) [m] of each
-    travels : (p,) bool: the joint travels on the near segment, as a shoulder does
     """
     data, pairs = model.pin.createData(), find_neighbours(model, quat_LS)
     pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
@@ -412,8 +411,7 @@ def find_joint_pairs(
         R_WS = [placement[name].rotation @ Rotation.from_quat(quat_LS[name]).as_matrix() for name in (near, far)]
         std[i] = max(LEVER_STD, LEVER_STD_OF_LENGTH * max(float(np.linalg.norm(lever)) for lever in levers_W))
         levers[i] = np.concatenate([R.T @ lever for R, lever in zip(R_WS, levers_W, strict=True)])
-    travels = np.array([near in spine and not model.table.is_mechanism for near, _ in pairs], dtype=bool)
-    return pairs, levers, std, travels
+    return pairs, levers, std
 
 
 def _locate_sensor(

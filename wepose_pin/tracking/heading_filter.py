@@ -86,20 +86,19 @@ _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 DRIFT_PSD = np.deg2rad(0.12) ** 2  # [rad²/s] of a heading in motion: soft tissue
 SCALE_STD = 0.002  # of a gyroscope's scale about the vertical; what the filters assume
 RATE_CHANGE_PSD = np.deg2rad(0.1) ** 2 / 900.0  # [rad²/s³] a sensor warms up under its strap
-# [rad] of the heading by a joint's acceleration: soft tissue follows the motion.
-JOINT_STD, JOINT_CORRELATION_S = np.deg2rad(0.5), 60.0
 # [m/s²] least misfit of a joint's accelerations; the recent one where it is larger.
 ACCELERATION_STD, ACCELERATION_CORRELATION_S = 0.07, 0.4
 # [m/s²] fixed in the sensor's frame: the tilt error of an orientation filter in motion, a degree, times gravity.
 FORCE_STD, FORCE_CORRELATION_S = np.deg2rad(1.0) * 9.81, 20.0
-HINGE_CORRELATION_S, CLOSURE_CORRELATION_S = 5.0, 20.0
+JOINT_CORRELATION_S, HINGE_CORRELATION_S, CLOSURE_CORRELATION_S = 60.0, 5.0, 20.0
 # [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
 AXIS_STD, TILT_STD = float(np.deg2rad(5.0)), float(np.deg2rad(2.0))
 RANGE_STD = np.deg2rad(10.0)  # [rad] of the limits of a hinge's range
 # Those of a person and of a mechanism, in this order: [rad/s] at which a heading drifts, apart from its gyroscope's
-# bias; [rad] of the heading by the acceleration of a joint that travels, as a shoulder; [rad] between a hinge's plane
-# and the segment below: a person's soft tissue turns the sensor above by 7 deg about its segment, all else is 4 deg.
-RATE_STD, GIRDLE_STD, HINGE_STD = np.deg2rad([[0.05, 0.2], [0.9, 0.5], [8.0, 0.7]])
+# bias; [rad] of the heading by a joint's acceleration, as soft tissue follows the motion and shoulders travel; [rad]
+# between a hinge's plane and the segment below: a person's soft tissue turns the sensor above by 7 deg about its
+# segment, all else is 4 deg.
+RATE_STD, JOINT_STD, HINGE_STD = np.deg2rad([[0.05, 0.2], [0.9, 0.5], [8.0, 0.7]])
 
 
 class HeadingFilter:
@@ -145,7 +144,7 @@ class HeadingFilter:
         kind, start_pose = int(model.table.is_mechanism), StartPose(model.neutral_rotations)
         self._rate_var = RATE_STD[kind] ** 2
         raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
-        self.pairs, levers, lever_std, travels = find_joint_pairs(model, raw if first.rate_hz >= LEAST_RATE_HZ else {})
+        self.pairs, levers, lever_std = find_joint_pairs(model, raw if first.rate_hz >= LEAST_RATE_HZ else {})
         # Hinges between two sensors; standard deviations [rad] of the axis about the long axis of the segment above and
         # across, and of the angle between the hinge's plane and the segment below.
         hinges: list[tuple[HingeJoint, float, float, float]] = []
@@ -202,7 +201,7 @@ class HeadingFilter:
         # Each state with its standard deviation at the start, and for how long [s] it is correlated.
         always, known = np.inf, np.sqrt(start[3])
         rate_std = np.hypot(RATE_STD[kind], np.where(np.isfinite(known), known, rate_std))
-        joint_std = np.where(travels, GIRDLE_STD[kind], JOINT_STD)
+        joint_std = np.full(len(self.pairs), JOINT_STD[kind])
         delay_std = np.full(k, AVERAGED_SAMPLES / first.rate_hz + CHIP_DELAY_STD)
         states = {
             "heading": (np.zeros(k), always),  # δ [rad]
