@@ -43,7 +43,6 @@ from ..errors import BadSession
 from ..rotations import product_terms
 
 ZERO_LENGTH = 1e-12  # [m] below which a vector is zero; its derivatives by the lengths alike
-LEAST_IN_PLANE = 0.1  # squared length of e's part in the plane, below which the slope of its angle grows no more
 BAND_HZ = (0.1, 1.5)  # what people move in
 LEAST_RATE_HZ = 20.0  # of recordings that are used
 # Where a sensor sits is known from its segment alone: in the middle, give or take this much on each axis; assumption.
@@ -285,18 +284,17 @@ def express_twist(quat_on: ca.SX, quat_moves: ca.SX, along: Sequence[float]) -> 
 
 def linearize_hinge(
     hinge: HingeJoint, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linearize a hinge of orientations (n, 4) at heading errors (2,) or (n, 2) [rad] of `moves` and `on`.
 
     Returns
     -------
     r : (n,) [rad] out of the hinge's plane
     H : (n, 4) its slope by the headings of `moves` and `on`, and by the axis along `across` and `tilted`
-    excess : (n,) [rad] beyond the hinge's range, signed
-    slope : (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
+    excess : (n,) [rad] beyond the hinge's range
     """
-    r, H, excess, slope = evaluate(_linearization(hinge), quat_on, quat_moves, headings)
-    return r[:, 0, 0], H[:, 0], excess[:, 0, 0], slope[:, 0, 0]
+    r, H, excess = evaluate(_linearization(hinge), quat_on, quat_moves, headings)
+    return r[:, 0, 0], H[:, 0], excess[:, 0, 0]
 
 
 @lru_cache(maxsize=128)
@@ -313,11 +311,7 @@ def _linearization(hinge: HingeJoint) -> ca.Function:
     middle, half = 0.5 * (hinge.range[0] + hinge.range[1]), 0.5 * (hinge.range[1] - hinge.range[0])
     off = ca.atan2(sine, cosine) - middle
     off -= 2.0 * np.pi * ca.floor(off / (2.0 * np.pi) + 0.5)
-    excess = ca.sign(off) * ca.fmax(ca.fabs(off) - half, 0.0)
-    by_sine, by_cosine = (ca.jacobian(part, headings[0]) for part in (sine, cosine))
-    squared = sine**2 + cosine**2
-    slope = (by_sine * cosine - by_cosine * sine) / ca.fmax(squared, LEAST_IN_PLANE)
-    rows = [ca.densify(value) for value in (r, H, excess, slope)]
+    rows = [ca.densify(value) for value in (r, H, ca.fmax(ca.fabs(off) - half, 0.0))]
     return ca.Function("hinge", [on, moves, headings], rows, {"cse": True})
 
 

@@ -7,7 +7,7 @@ shows, as in a static phase. The headings here are those without its corrections
 one more observation. Differences of two or more δ are observed by (`wepose_pin.observations`):
 
 - the acceleration of a joint, which two sensors measure, with their levers as unknowns;
-- a hinge: the long axis of the segment below stays in the plane across the hinge's axis, within its range;
+- a hinge: the long axis of the segment below stays in the plane across the hinge's axis;
 - two points that coincide: palms in a phase `clasp`.
 
 Errors by soft tissue, tilted hinge axes and travelling joints are correlated over seconds or over the whole recording.
@@ -93,7 +93,7 @@ FORCE_STD, FORCE_CORRELATION_S = np.deg2rad(1.0) * 9.81, 20.0
 JOINT_CORRELATION_S, HINGE_CORRELATION_S, CLOSURE_CORRELATION_S = 60.0, 5.0, 20.0
 # [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
 AXIS_STD, TILT_STD = float(np.deg2rad(5.0)), float(np.deg2rad(2.0))
-RANGE_STD = np.deg2rad(10.0)  # [rad] of the limits of a hinge's range
+RANGE_STD = np.deg2rad(10.0)  # [rad] of the limits of a hinge's range, within which a lost heading is searched
 # Those of a person and of a mechanism, in this order: [rad/s] at which a heading drifts, apart from its gyroscope's
 # bias; [rad] of the heading by a joint's acceleration, as soft tissue follows the motion and shoulders travel; [rad]
 # between a hinge's plane and the segment below: a person's soft tissue turns the sensor above by 7 deg about its
@@ -400,18 +400,16 @@ class HeadingFilter:
         return misfits
 
     def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> None:
-        """Add the hinges and their ranges."""
+        """Add the hinges, without outliers."""
         samples = max(1.0, HINGE_CORRELATION_S * self.rate_hz)
         for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
             moves, on = columns[:2]
             if unreliable[on] or unreliable[moves]:
                 continue
-            r, H, excess, slope = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], x[columns[:2]])
+            r, H, _ = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], x[columns[:2]])
             r = r + H[:, 2:] @ x[columns[2:]]
             is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
             self._add(columns, H, r, is_inlier / (std**2 * samples))
-            beyond = (excess != 0.0) / (RANGE_STD**2 * samples)
-            self._add(columns[:2], slope[:, None] * [1.0, -1.0], excess, beyond)
 
     def _add_gap(self, rows: tuple[np.ndarray, ...], correlated: float) -> None:
         """Add the gap between the palms, without outliers; so many samples are one observation."""
@@ -513,7 +511,7 @@ class HeadingFilter:
             headings = np.tile(x[columns[:2]], (m, g, 1))
             headings[:, :, 0 if i == moves else 1] += turns
             quat_on, quat_moves = (np.repeat(quat_WL[:, at], g, axis=0) for at in (on, moves))
-            r, H, excess, _ = linearize_hinge(hinge, quat_on, quat_moves, headings.reshape(-1, 2))
+            r, H, excess = linearize_hinge(hinge, quat_on, quat_moves, headings.reshape(-1, 2))
             by_other, H = H[:, 0 if other == moves else 1], H[:, 2:]
             r = r + H @ x[columns[2:]]
             r_var = std**2 + var[other] * by_other**2 + np.sum(H @ self.P[np.ix_(columns[2:], columns[2:])] * H, axis=1)

@@ -1,4 +1,4 @@
-"""Correction of headings by what neighbouring segments share: joint accelerations, hinges, their ranges, joined hands.
+"""Correction of headings by what neighbouring segments share: joint accelerations, hinges, joined hands.
 
 The filters' tilt is good and their headings drift. Time is cut into intervals of equal length, the knots, and
 `heading_filter` estimates one error of each heading a knot; an error common to all segments is unobservable. Offline a
