@@ -87,9 +87,7 @@ class AmekfParams(base.FilterParams):
     impact: Positive = 100.0  # [m/s²] beyond it is an impact: the excess, integrated, is a velocity error
     tilt_std: NonNegative = 0.2  # [rad] at the start, which may be in motion
     gyro_matrix_std: NonNegative = 0.002  # each entry of M
-    gyro_matrix_walk: NonNegative = 1e-6  # [1/√s]
     gyro_bias_walk: NonNegative = 5e-5  # [rad/s/√s], 100 deg/h in 100 s: it changes with motion too
-    static_bias_std: NonNegative = 1e-4  # [rad/s] of the mean of gyro over a static block about the bias, without sway
     static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg
     accel_bias_walk: NonNegative = 1e-4  # [m/s²/√s]
@@ -370,8 +368,7 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
     noise_psd = np.zeros(STATES)
     noise_psd[ERROR.attitude] = gyro_var / rate_hz
     noise_psd[ERROR.velocity] = accel_var * noise.gravity**2 / rate_hz
-    noise_psd[ERROR.gyro_bias], noise_psd[ERROR.gyro_matrix] = p.gyro_bias_walk**2, p.gyro_matrix_walk**2
-    noise_psd[ERROR.accel_bias] = p.accel_bias_walk**2
+    noise_psd[ERROR.gyro_bias], noise_psd[ERROR.accel_bias] = p.gyro_bias_walk**2, p.accel_bias_walk**2
     # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
     white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
     model = base.make_record(
@@ -382,7 +379,7 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
         velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
         position_var=p.position_std**2 * p.motion_s / length,  # [m²]
         static_velocity_var=p.static_speed_std**2,  # [m²/s²]
-        static_bias_var=p.static_bias_std**2 + white + sway / length,  # [rad²/s²] of gyro's mean about the bias
+        static_bias_var=white + sway / length,  # [rad²/s²] of gyro's mean about the bias
         # [rad²/s] A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
         static_heading_psd=p.static_turn_noise**2 + sway / 8.0,
         rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
