@@ -260,6 +260,9 @@ def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: S
     assert len(log.quat_WL) > 1000
     (tmp_path / "subject.toml").write_text(log.header["subject"], encoding="utf-8")
     assert_is_tracked_so(log, track(log.recording, wp.load_subject(tmp_path), causal=True))
+    watcher, sensors = Watcher(), {n: s for n, s in recording.sensors.items() if n != "right_forearm"}
+    live.run_session(ReplaySource(first(replace(recording, sensors=sensors), 9), math.inf), setup, outputs=[watcher])
+    assert "are not tracked (right forearm)" in str(watcher.statuses[0].problems)
 
 
 def test_heading_resets_are_in_the_file_and_outputs_get_the_poses(recording: Recording, tmp_path: Path) -> None:

@@ -29,8 +29,9 @@ from test_causal import first
 
 import wepose_pin as wp
 from wepose_pin import Simulation, retargeting
-from wepose_pin.live import LivePose, StreamInfo
+from wepose_pin.live import LivePose, Status, StreamInfo
 from wepose_pin.live.outputs import RobotOutput
+from wepose_pin.live.state import SensorStatus
 from wepose_pin.writers import write_session
 
 pytest.importorskip("daqp")
@@ -322,7 +323,8 @@ def test_a_source_that_dies_stops_the_robot_until_the_person_says_so(
         out.show(poses[shown % len(poses)]._replace(time=1e4 + shown * 0.005))
         shown += 1
 
-    out.open()
+    with pytest.raises(wp.BadData, match="arm's right arm follows right_forearm, which the sensors do not measure"):
+        out.status(Status("start_pose", "", sensors=(SensorStatus("torso"), SensorStatus("right_upper_arm"))))
     wait_until(lambda: receiver.messages)
     out.start(StreamInfo(tuple(pose.quat_WL), tuple(pose.points), 100.0))
     first = receiver.messages[0]

@@ -165,9 +165,8 @@ def test_kinds_of_problems_are_bounded(source: UdpSource, sender: socket.socket)
     assert sum(source.problems.values()) == 100
 
 
-def test_sensors_are_found_where_they_are_not_given(sender: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> None:
     """The second one begins when the first has long been seen; what came while it waited comes once."""
-    monkeypatch.setattr("wepose_pin.live.sources.udp.COLLECT_S", 3.0)
     port = find_free_port()
     source = open_source(f"udp:{port}")
     source.open()

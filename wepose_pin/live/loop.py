@@ -84,6 +84,8 @@ class LiveLoop(Stage):
         check_segments(self.model.table, source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
             _ = self.model.reaches
+        calibrated = () if setup.subject is None or setup.remounted else setup.subject.mounts
+        self._absent = [name for name in calibrated if name not in source.sensors]
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
         self._correct_soft_tissue = make_correction(self.model, tuple(source.sensors))
@@ -253,6 +255,9 @@ class LiveLoop(Stage):
         for name, count in zip(sensors, clock.counts[:, CUT_OFF].tolist(), strict=True):
             if count:
                 problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = count
+        if self._absent:
+            names = join_names(self._absent)
+            problems[f"sensors of the subject that sent nothing at the start and are not tracked ({names})"] = 1
         problems |= {self.log.problem: 1} if self.log.problem else {}
         recorded_s = 0.0 if self.log.path is None else max(0.0, clock.newest - clock.begin)
         latency = list(itertools.islice(reversed(self._latency), SHOWN_LATENCIES)) or [0.0]

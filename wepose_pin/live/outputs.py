@@ -171,7 +171,7 @@ class RobotOutput(Output):
     Parameters
     ----------
     to : ``PORT`` of this machine, or ``HOST:PORT``
-    sensors : of the person, if they are known; `WeposeError` is raised where an arm has none
+    sensors : of the person, if they are known; `WeposeError` is raised where an arm has none, else by `status`
     subject, table : whose arms move, None: the population prior's; the body, None: the upper body
     speed : of a replay
 
@@ -225,8 +225,10 @@ class RobotOutput(Output):
     def show(self, pose: LivePose) -> None:
         self._newest = time.monotonic(), pose
 
-    def status(self, status: Status) -> None:  # noqa: ARG002
+    def status(self, status: Status) -> None:
         self.open()  # it holds from before the start pose
+        if status.sensors and self._observer is None and status.state != "ended":  # of a source that had to find them
+            check_person_arms(self.robot, [each.segment for each in status.sensors], table=self._table)
         if self._failure is not None:
             raise self._failure
 

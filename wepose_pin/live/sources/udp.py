@@ -21,7 +21,7 @@ from . import MAX_TIME, HostClock, Source, SourceKind, SourceOptions
 LOOPBACK = "127.0.0.1"
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
 BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
-COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
+COLLECT_S = 3.0  # [s] after the first sample in which the other sensors may appear
 MAX_SPEED = 20.0  # of a sender's clock relative to ours; above it, the sender's times are not in seconds
 MAX_SENSORS = 64  # of any name
 MAX_CLOCKS = 64  # of senders; one that opens a new socket for each datagram has many
@@ -96,7 +96,7 @@ class DatagramSource(Source):
             self.sensors = tuple(self.segments or ())
 
     def connect(self, timeout_s: float) -> bool:
-        """Wait for sensors where none are given: those that send within a second of the first sample are taken."""
+        """Wait for sensors where none are given: those that send within `COLLECT_S` of the first sample."""
         if not self._searching:
             return True
         self._waiting += self._read_new(timeout_s)
