@@ -15,9 +15,13 @@ from wepose_pin.simulation import simulate_person
 @pytest.mark.parametrize(("shown", "used"), [(7.0, 0.675), (0.4, 0.4), (-2.0, 0.0)])
 def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
     hinge = Hinge(np.array((0.0, 1.0, 0.0)), 0.05, shown)
-    subject = replace(population_subject(), hinges={"right_elbow": hinge})
-    personal = subject.shape(load_model()).personal["right_upper_arm"]
-    assert personal.soft_tissue.mean_per_twist == pytest.approx(used)
+    order = tuple(mount_rows("right_upper_arm"))
+    subject = replace(population_subject(), hinges={"right_elbow": hinge}, order=order, covariance=1e-2 * np.eye(3))
+    personal = subject.shape(load_model()).personal
+    assert personal["right_upper_arm"].soft_tissue.mean_per_twist == pytest.approx(used)
+    # Soft tissue in any pose is part of what is known of the mount, and of the twist that the hinge shows.
+    assert not any(personal["right_upper_arm"].soft_tissue.std)
+    assert all(personal["right_forearm"].soft_tissue.std)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.13])

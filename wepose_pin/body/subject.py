@@ -212,8 +212,13 @@ class Subject:
                 plane_var = (scatter * HINGE_PLANE_STD) ** 2
                 weight = start_var / (start_var + plane_var)
                 start, start_var = float(weight * angle), weight * plane_var
+            # Soft tissue in any pose is part of the uncertainty of what a motion has shown: of the tilts of mounts that
+            # are not known better, and of the twist by a hinge. It does not count again.
+            tissue = make_personal(segment.soft_tissue, share, lag, scatter)
+            tilt_std = [self.std(row) for row in mount_rows(name)[:2]]
+            is_counted = [*np.greater_equal(tilt_std, tissue.std[:2]), name in shown]
             personal[name] = segment._replace(
-                soft_tissue=make_personal(segment.soft_tissue, share, lag, scatter),
+                soft_tissue=tissue._replace(std=tuple(np.where(is_counted, 0.0, tissue.std))),
                 start_mean=(*segment.start_mean[:2], start),
                 start_std=(*segment.start_std[:2], float(np.sqrt(start_var))),
             )

@@ -379,7 +379,8 @@ def _project_to_subject(
     """Return names and covariance of the lengths, mount errors and girdles, from that of x.
 
     Mounts are R_LS = exp(−ε) Rz(ψ) R_VS(start). Their errors are turned from the frames that equal W in the start pose
-    to those of the segments. The tilt of a new mount is that of one recording: soft tissue in any pose is added to it.
+    to those of the segments. The tilt of a new mount is that of one recording: soft tissue in any pose is added to it,
+    and tracking does not add it again (`Subject.shape`).
     That of the segment that faces x in the start pose turns the headings of all mounts alike. By how much a person
     turns a segment about the vertical in the start pose is not in them: no closure shows it.
     """
