@@ -62,8 +62,7 @@ LEAST_LEARNED, LEARNED_VARIANCE_RATIO = 1e-4, 4.0
 MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accelerations
 # Share of the variance of a pelvis', leg's or head's heading that is by the torso's turn: 4 of 5° (docs/people.md).
 TURN_VAR_SHARE = (4.0 / 5.0) ** 2
-OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
-HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
+OUTLIER_STDS = 5.0  # standard deviations above which a gap between the palms is an outlier
 ITERATIONS = 2  # linearizations of an update
 # A loss may leave a heading so uncertain that what is observed has several minima: above `SEARCH_STD` [rad] relative to
 # others. It is searched on a circle of headings, each weighed by what is observed since, until it is known to
@@ -400,16 +399,14 @@ class HeadingFilter:
         return misfits
 
     def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> None:
-        """Add the hinges, without outliers."""
+        """Add the hinges."""
         samples = max(1.0, HINGE_CORRELATION_S * self.rate_hz)
         for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
             moves, on = columns[:2]
             if unreliable[on] or unreliable[moves]:
                 continue
             r, H, _ = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], x[columns[:2]])
-            r = r + H[:, 2:] @ x[columns[2:]]
-            is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
-            self._add(columns, H, r, is_inlier / (std**2 * samples))
+            self._add(columns, H, r + H[:, 2:] @ x[columns[2:]], 1.0 / (std**2 * samples))
 
     def _add_gap(self, rows: tuple[np.ndarray, ...], correlated: float) -> None:
         """Add the gap between the palms, without outliers; so many samples are one observation."""
