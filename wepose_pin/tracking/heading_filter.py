@@ -63,6 +63,7 @@ MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accele
 # Share of the variance of a pelvis', leg's or head's heading that is by the torso's turn: 4 of 5° (docs/people.md).
 TURN_VAR_SHARE = (4.0 / 5.0) ** 2
 OUTLIER_STDS = 5.0  # standard deviations above which a gap between the palms is an outlier
+HINGE_OUTLIER = np.deg2rad(30.0)  # [rad] off its plane, above which a segment shows a wrong mount and no heading
 ITERATIONS = 2  # linearizations of an update
 # A loss may leave a heading so uncertain that what is observed has several minima: above `SEARCH_STD` [rad] relative to
 # others. It is searched on a circle of headings, each weighed by what is observed since, until it is known to
@@ -399,14 +400,15 @@ class HeadingFilter:
         return misfits
 
     def _add_hinges(self, x: np.ndarray, quat_WL: np.ndarray, unreliable: np.ndarray) -> None:
-        """Add the hinges."""
+        """Add the hinges, without outliers."""
         samples = max(1.0, HINGE_CORRELATION_S * self.rate_hz)
         for hinge, columns, std in zip(self.hinges, self._hinge_columns, self._hinge_std, strict=True):
             moves, on = columns[:2]
             if unreliable[on] or unreliable[moves]:
                 continue
             r, H, _ = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], x[columns[:2]])
-            self._add(columns, H, r + H[:, 2:] @ x[columns[2:]], 1.0 / (std**2 * samples))
+            r = r + H[:, 2:] @ x[columns[2:]]
+            self._add(columns, H, r, (np.abs(r) < HINGE_OUTLIER) / (std**2 * samples))
 
     def _add_gap(self, rows: tuple[np.ndarray, ...], correlated: float) -> None:
         """Add the gap between the palms, without outliers; so many samples are one observation."""
