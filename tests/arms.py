@@ -1,7 +1,5 @@
 """A robot arm of our own, in the forms that retargeting must cope with, and a person who moves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names of the upper body, and how well a body follows orientations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Headless Chromium in real time, for pages that talk to a server: steered through pipes, so nothing listens."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Fixtures: where the real recordings lie, and one simulated person that several tests look at."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

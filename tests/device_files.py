@@ -4,8 +4,6 @@ Tables are as docs/formats.md has them, from files that labs have published; bag
 few lines here, from the specification.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path

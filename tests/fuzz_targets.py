@@ -4,8 +4,6 @@ A target takes its input, or says in one line why not. All tables of devices go 
 stand for all. Parquet, MATLAB, HDF5 and C3D are not here: libraries parse them, and some die of a damaged file.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import socket

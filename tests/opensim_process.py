@@ -1,7 +1,5 @@
 """Calls functions of `opensim_peer` in a process of its own: OpenSim's casadi and ours cannot live in one."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

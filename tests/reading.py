@@ -1,7 +1,5 @@
 """What a reader sees of a page."""
 
-from __future__ import annotations
-
 import re
 from html import unescape
 

@@ -1,7 +1,5 @@
 """What tests of sources share: a source that is connected, and the samples that come from it."""
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable, Iterator

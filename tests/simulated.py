@@ -1,7 +1,5 @@
 """A simulated subject, and what holds in every simulation whatever its imperfections: the physics of its sensors."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation

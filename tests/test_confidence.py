@@ -1,7 +1,5 @@
 """Standard deviations that are carried from filter and calibration to the points."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the figure does to show a step of the guide."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

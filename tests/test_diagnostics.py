@@ -1,7 +1,5 @@
 """Diagnostics: every code that is made has its texts, every text can be filled, the page of codes is whole."""
 
-from __future__ import annotations
-
 import ast
 import json
 import string

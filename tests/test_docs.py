@@ -1,7 +1,5 @@
 """What the pages for contributors name exists: rooms, modules, functions, files, commands, options, links."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

@@ -1,7 +1,5 @@
 """Error metrics on hand-made cases with known answers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every example runs as it stands, and writes what it says."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Files for other programs: each read back by a reader of others, with the numbers that went in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

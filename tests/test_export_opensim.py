@@ -1,7 +1,5 @@
 """OpenSim's files against the rules of its readers, and against OpenSim itself where it is installed."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping

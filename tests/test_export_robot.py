@@ -1,8 +1,6 @@
 """Motions by joints for robot learning, ROS 2 and viewers: each read back by the reader of others, or by one of ours
 that was written from the format's description."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

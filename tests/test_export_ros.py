@@ -1,7 +1,5 @@
 """Bags, MCAP files and recordings of rerun, each read back by the package of its format."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

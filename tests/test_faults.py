@@ -3,8 +3,6 @@
 The outcome is a result that is whole, or exit code 2 (130 where a signal stopped it), one line and nothing left behind.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import resource

@@ -1,7 +1,5 @@
 """Orientation filters: against plain transcriptions of their papers, against physics, on a real sensor."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

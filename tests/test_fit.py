@@ -1,7 +1,5 @@
 """The closest pose within limits: against brute force, the limits, and the recording of a person."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

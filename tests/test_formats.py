@@ -1,7 +1,5 @@
 """Files of devices and programs (`device_files`) are read back in SI, and what is wrong in them is one line."""
 
-from __future__ import annotations
-
 import sys
 import zipfile
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 What was found by it, each with what should happen: test_fuzz_found.py.
 """
 
-from __future__ import annotations
-
 import re
 import zlib
 from pathlib import Path

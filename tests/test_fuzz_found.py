@@ -1,7 +1,5 @@
 """What fuzzing and faults found, each as it is told now; nothing of it may come back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The guided session: who follows it ends with the calibration that the recording gives; who does not is told so."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """From sensors that send to tracking, in a browser: a simulated person who follows the page, in real time."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

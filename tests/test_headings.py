@@ -1,7 +1,5 @@
 """Headings held together by joined hands, elbows and the accelerations of joints."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations, pairwise
 

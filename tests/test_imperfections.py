@@ -1,7 +1,5 @@
 """Imperfections of simulated sensors, and switches: sizes as documented, each independent of the others."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`wepose info`: what a file is, and a session that can be read as it is printed."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Orientations to configuration to points, against the closed form p = Σ R l and brute force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Legs: the whole body's URDF, activities with known truth, and their joint angles through the commands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The live loop: what it shows is what it records and what tracking the file gives, whatever befalls the samples."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

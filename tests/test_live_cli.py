@@ -1,7 +1,5 @@
 """`wepose live` as a user runs it: killed, stopped, and told wrong things."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

@@ -1,7 +1,5 @@
 """The pose out: what is sent, how often, that nobody waits for it, and that the documented example reads it."""
 
-from __future__ import annotations
-
 import json
 import re
 import select

@@ -1,7 +1,5 @@
 """The live page: what a browser gets, how fast, who else gets anything, and what it looks like."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http.client

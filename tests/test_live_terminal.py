@@ -1,7 +1,5 @@
 """The terminal's view: what it says, when, and that it leaves the terminal as it found it."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

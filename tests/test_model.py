@@ -1,7 +1,5 @@
 """The body model, against Pinocchio's own reading of the same URDF, the XML itself, and models of others."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import xml.etree.ElementTree as ET
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`wepose angles`: low-pass, stated uncertainty of ranges, tables, figures, page."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET

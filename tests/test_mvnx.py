@@ -1,7 +1,5 @@
 """Xsens MVNX: a real export, tracked, against Xsens's own positions; made files of each version, and damaged ones."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path

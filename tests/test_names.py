@@ -1,7 +1,5 @@
 """Only the table of a body names its segments, points, lengths and hinges: no other string of the package does."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

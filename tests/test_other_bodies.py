@@ -1,7 +1,5 @@
 """The rooms after tracking on a body that is no upper body: legs, by a URDF and a table made here."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

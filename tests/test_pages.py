@@ -1,7 +1,5 @@
 """Pages beside a result: one that fails is a warning; the result has landed before, and nothing is half written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

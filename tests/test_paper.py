@@ -1,7 +1,5 @@
 """The paper's formulation of the calibration, and tracking without heading correction."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

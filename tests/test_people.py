@@ -1,7 +1,5 @@
 """The preset `people`: sizes as the literature has them, physics kept, closures kept; `mild` is a smaller one."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The scripts of docs/play.md, run as they stand there on a trajectory."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Plug-ins: the example's distribution is installed, and what it registers is used as what this package has."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Poses and bows beside joined hands: what they show, and what happens where people do others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Protocols as data: what they show, and what a wrong one is told."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from functools import cache

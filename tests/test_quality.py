@@ -1,7 +1,5 @@
 """What a calibration says of itself: each way in which a session goes wrong is recognised and said, or solved."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Ten random recordings of ordinary behaviour, and those that failed once (``tests/random_recordings/README.md``)."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reading sessions: tables, clocks, gaps, resampling, plausibility, pieces."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

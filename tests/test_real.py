@@ -1,7 +1,5 @@
 """RING and UR5: read as they are, registered on a stretch that is not scored, and what the filters make of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """C3D, TRC and MVNX as references: joints from markers, and their clock, world and frames brought to a result's."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Repetitions of a movement: found where they are, however fast, with rests, cut at the ends; none where none are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The calibration's report: what it says, that it opens offline, that it bears what is missing."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report of a tracked recording: what it says, what it warns of, that it opens offline and stays small."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

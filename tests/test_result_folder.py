@@ -1,7 +1,5 @@
 """A result in a folder that holds an earlier result, or files of the user: `--force` deletes and replaces only ours."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

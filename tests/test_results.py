@@ -1,7 +1,5 @@
 """`python -m benchmarks.results`: numbers are stored, compared bit for bit, and renamed by a table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`wepose retarget`: its files, its exit codes, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

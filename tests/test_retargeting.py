@@ -1,7 +1,5 @@
 """Retargeting on an arm of our own: following, collisions, targets out of reach, jumps, losses, other forms of arms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

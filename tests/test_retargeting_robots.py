@@ -1,7 +1,5 @@
 """Retargeting on robots of example-robot-data, where they are installed, with the real recording where it is there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Limits: bounds on the acceleration that never lead to a violation, the stop that each step of a robot leaves open."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

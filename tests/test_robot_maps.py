@@ -1,7 +1,5 @@
 """Maps of robots, and what is refused of a robot: each in a line that says where."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

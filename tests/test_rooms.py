@@ -1,7 +1,5 @@
 """The rooms import only from rooms above them, lazy imports included: the contract stands in pyproject.toml."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Rotations: group axioms, small angles, the compiled step against SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

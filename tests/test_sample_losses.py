@@ -1,7 +1,5 @@
 """Calibration of sensors that lost samples: what is connected with the start pose is used."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What --interval and --phase select: one rule for all commands that read a result."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

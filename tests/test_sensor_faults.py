@@ -1,7 +1,5 @@
 """Sensors that do not measure: named while reading, lost from where they stop, never believed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The rate of each sensor, as its samples come."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

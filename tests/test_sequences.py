@@ -1,7 +1,5 @@
 """Protocols joined in one session, free motion, and an earlier calibration of the person."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the pages show works: commands are understood and run, TOML and Python are what they say, links are checked."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

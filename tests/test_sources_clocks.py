@@ -1,7 +1,5 @@
 """Senders' clocks on ours: offset, drift, jitter, and clocks that jump."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

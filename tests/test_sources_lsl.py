@@ -1,7 +1,5 @@
 """Lab Streaming Layer: streams found, read, lost and taken up again, on this machine only."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The plug-in examples/mti on pseudo-terminals: read, lost and found again; frames as the protocol describes them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

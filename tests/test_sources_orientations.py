@@ -1,7 +1,5 @@
 """The plug-in examples/slimevr, against a sender written from the protocol's description, byte by byte."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import sys

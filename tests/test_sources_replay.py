@@ -1,7 +1,5 @@
 """A recording as a source: nothing lost, nothing early, at any speed."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Datagrams: what is documented is read, whatever else comes is counted and harms nothing."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket

@@ -1,7 +1,5 @@
 """When a sensor is static: the paper's conditions (1) to (4), what they miss, and the phase that is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Subjects: the anthropometric prior, the file, what is wrong in one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bad tables and protocols give one line that says file, key, value and what would be right; foreign bodies load."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Torques: a pendulum in closed form, power against energy, and what cannot have any."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

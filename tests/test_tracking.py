@@ -1,7 +1,5 @@
 """The whole chain on the simulated person, and on the real one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

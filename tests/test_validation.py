@@ -1,7 +1,5 @@
 """`python -m benchmarks validation`: the experiments are seeded and scored as they say; the page that is written."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

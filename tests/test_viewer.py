@@ -1,7 +1,5 @@
 """The page that plays a motion: whole in itself, true to the motion, and what Chromium draws of it."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

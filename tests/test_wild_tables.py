@@ -1,7 +1,5 @@
 """CSV files as loggers and spreadsheets write them: `wepose info --write` finds their columns, units and clock."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Sessions and results read back as they were; what is in the way of a result leaves everything as it was."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

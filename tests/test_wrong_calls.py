@@ -1,7 +1,5 @@
 """Wrong calls of the public functions, from a table: each ends in one line that names what is wrong with it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache

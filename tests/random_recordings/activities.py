@@ -4,8 +4,6 @@ Angles: trunk yaw, pitch (forward), roll (to the right); arm flex (forward), abd
 wrist. What an activity does not name hangs or is upright. Rates stay within what people reach and sensors measure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

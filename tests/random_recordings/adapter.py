@@ -3,8 +3,6 @@
 Where a name of the project changes, it changes here and nowhere else in this folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

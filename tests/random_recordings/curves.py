@@ -1,7 +1,5 @@
 """Smooth functions of time that joint angles are made of: no samples, so that every rate sees the same motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

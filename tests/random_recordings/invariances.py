@@ -1,7 +1,5 @@
 """Equal physics gives equal results: the same recording written or sampled otherwise, tracked, and compared."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

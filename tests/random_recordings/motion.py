@@ -1,7 +1,5 @@
 """A person's motion as a function of time: activities one after another, joined smoothly, with sway and breath."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Each oracle gives failures: `Failure(oracle, command, message)`. None knows how the project works.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

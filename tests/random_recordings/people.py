@@ -4,8 +4,6 @@ Nothing here knows the project: own names, own geometry. Frames: world z up; eve
 while the person stands upright, arms hanging, facing x (left is y). Metres, radians; rotations take segment to world.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 `Variant` is the same physics written or sampled otherwise, for what must not depend on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 

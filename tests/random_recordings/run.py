@@ -4,8 +4,6 @@ One line of JSON a seed is added to DIR/seeds.jsonl; what is there already is no
 writes one case's files there and says what it holds. Exit code 1: an oracle failed.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """What a worn inertial sensor gives of a motion: data-sheet errors, ranges, and faults."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """One seed: its recording is written, its commands are run, and every oracle is asked."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable
