@@ -15,7 +15,7 @@ They are states, so that a long recording does not average them away.
 """
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,7 +30,7 @@ from ..body.mounts import (
     StartPose,
     compute_start_heading_var,
 )
-from ..body.subject import Subject
+from ..body.subject import Hinge, Subject
 from ..body.table import HingeJoint
 from ..calibration import load_protocol
 from ..calibration.headings import LEAST_MISMATCH, LEAST_S, SAMPLES_HZ, estimate_heading
@@ -145,18 +145,7 @@ class HeadingFilter:
         self._rate_var = RATE_STD[kind] ** 2
         raw = {name: quat for name, quat in quat_LS.items() if name in first.imus}
         self.pairs, levers, lever_std = find_joint_pairs(model, raw if first.rate_hz >= LEAST_RATE_HZ else {})
-        # Hinges between two sensors; standard deviations [rad] of the axis about the long axis of the segment above and
-        # across, and of the angle between the hinge's plane and the segment below.
-        hinges: list[tuple[HingeJoint, float, float, float]] = []
-        # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
-        calibrated = {} if first.remounted else subject.hinges
-        for hinge in find_hinges(model, start_pose, self.names):
-            if (own := calibrated.get(hinge.name)) is not None:
-                hinge = hinge._replace(axis=start_pose.turn(hinge.on, own.axis), per_twist=own.per_twist or 0.0)
-                hinges.append((hinge, AXIS_STD, TILT_STD, own.std))
-            elif not kind:
-                axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
-                hinges.append((hinge, axis_std, hinge.tilt_std, hinge.softness))
+        hinges = _list_hinges(model, start_pose, self.names, {} if first.remounted else subject.hinges)
         self.hinges = tuple(hinge for hinge, *_ in hinges)
         axis_stds, tilt_stds, plane_stds = np.array([stds for _, *stds in hinges]).reshape(-1, 3).T
         self._hinge_std = np.maximum(plane_stds, HINGE_STD[kind])
@@ -178,22 +167,15 @@ class HeadingFilter:
         # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate, which is at first [rad/s] a
         # gyroscope's bias, or the drift of measured orientations.
         self._drift_psd, rate_std = np.full(k, DRIFT_PSD), np.full(k, MEASURED_RATE_STD)
-        start_vars = np.full((2, k), REFERENCE_START_STD**2)
         for i, name in enumerate(self.names):
             if name in noises:  # a gyroscope's white noise may be more
                 gyro_psd = float(np.trace(noises[name].gyro_cov)) / (3.0 * first.rate_hz)
                 self._drift_psd[i] = max(DRIFT_PSD, gyro_psd)
                 rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
-            if name != model.table.reference:
-                start_vars[:, i] = [
-                    compute_start_heading_var(first, name, subject, StartPose(table=model.table, repeat_share=share))
-                    for share in (repeat_share, 1.0)
-                ]
-        # Since W's x is where the torso faces, its turn is an error of all headings that it does not carry with it.
-        carried = [bool(kind) or model.find_trunk(name) in (None, model.table.reference) for name in self.names]
-        shares = TURN_VAR_SHARE * np.outer(np.logical_not(carried), np.logical_not(carried))
-        np.fill_diagonal(shares, 1.0)
-        self.start_cov, self._again_cov = (shares * np.minimum.outer(var, var) for var in start_vars)
+        # After the start pose, and after another one than that of the calibration.
+        self.start_cov, self._again_cov = (
+            _compute_start_covariance(first, self.names, subject, model, share) for share in (repeat_share, 1.0)
+        )
         # (k, k) [rad²]; a calibration knows the headings of mounts against each other better than that of each.
         self.mount_cov = LEAST_MOUNT_VAR * np.eye(k)
         if not first.remounted:
@@ -215,27 +197,9 @@ class HeadingFilter:
             "delay": (delay_std, always),  # [s] of an accelerometer against its gyroscope
             "lever": (np.tile(lever_std[:, None], 6), always),  # [m] of the near and the far sensor from the joint
         }
-        ends = np.cumsum([std.size for std, _ in states.values()])
-        places = np.split(np.arange(ends[-1]), ends[:-1])
-        self._columns = c = {
-            name: own.reshape(std.shape) for own, (name, (std, _)) in zip(places, states.items(), strict=True)
-        }
-        std = np.concatenate([std.ravel() for std, _ in states.values()])
-        self._decay = np.concatenate([np.full(std.size, np.exp(-self.knot_s / t)) for std, t in states.values()])
-        self._process_var = (1.0 - self._decay**2) * std**2
-        self._process_var[c["rate"]] = RATE_CHANGE_PSD * self.knot_s
-        self.x, self.P = np.zeros(len(std)), np.diag(std**2)
-        index = self.names.index
-        self._pair_columns = []  # (17,) each: headings of its segments, joint; lever, force and delay near and far
-        self.x[c["lever"]], self._levers = levers, (levers, lever_std)
-        for i, pair in enumerate(self.pairs):
-            near, far, lever = index(pair[0]), index(pair[1]), c["lever"][i]
-            sides = [(*own, *c["force"][at], c["delay"][at]) for own, at in ((lever[:3], near), (lever[3:], far))]
-            self._pair_columns.append(np.array([near, far, c["joint"][i], *sides[0], *sides[1]]))
-        self._hinge_columns = [  # (4,) each: headings of the segments below and above, axis, tilt
-            np.array([index(hinge.moves), index(hinge.on), c["axis"][i], c["tilt"][i]])
-            for i, hinge in enumerate(self.hinges)
-        ]
+        self._set_states(states)
+        self.x[self._columns["lever"]], self._levers = levers, (levers, lever_std)
+        self._pair_columns, self._hinge_columns = self._find_columns()
         self._shape_cov = subject.shape_covariance(model.table)
         self.reset(np.zeros(k))
         # Recent misfit e of each joint's accelerations, with its force f: sums of e fᵀ (9), e² (3) and f² (3) [m²/s⁴]
@@ -253,6 +217,36 @@ class HeadingFilter:
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
         self._last_quat: np.ndarray | None = None  # (1, k, 4) of the last knot
         self._clasped_before = False  # whether the palms were joined in the last knot
+
+    def _set_states(self, states: Mapping[str, tuple[np.ndarray, float]]) -> None:
+        """Lay out x by the standard deviations of the `states` and their correlation times [s]."""
+        ends = np.cumsum([std.size for std, _ in states.values()])
+        places = np.split(np.arange(ends[-1]), ends[:-1])
+        self._columns = {
+            name: own.reshape(std.shape) for own, (name, (std, _)) in zip(places, states.items(), strict=True)
+        }
+        std = np.concatenate([std.ravel() for std, _ in states.values()])
+        self._decay = np.concatenate([np.full(std.size, np.exp(-self.knot_s / t)) for std, t in states.values()])
+        self._process_var = (1.0 - self._decay**2) * std**2
+        self._process_var[self._columns["rate"]] = RATE_CHANGE_PSD * self.knot_s
+        self.x, self.P = np.zeros(len(std)), np.diag(std**2)
+
+    def _find_columns(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Find the columns of x that each pair and each hinge observes.
+
+        Of a pair (17,): headings of its segments, joint; lever, force and delay near and far. Of a hinge (4,): headings
+        of the segments below and above, axis, tilt.
+        """
+        c, index, pairs = self._columns, self.names.index, []
+        for i, pair in enumerate(self.pairs):
+            near, far, lever = index(pair[0]), index(pair[1]), c["lever"][i]
+            sides = [(*own, *c["force"][at], c["delay"][at]) for own, at in ((lever[:3], near), (lever[3:], far))]
+            pairs.append(np.array([near, far, c["joint"][i], *sides[0], *sides[1]]))
+        hinges = [
+            np.array([index(hinge.moves), index(hinge.on), c["axis"][i], c["tilt"][i]])
+            for i, hinge in enumerate(self.hinges)
+        ]
+        return pairs, hinges
 
     def reset(self, headings: np.ndarray, *, again: bool = False) -> None:
         """Set δ = s − ε_z (k,) [rad] after a start pose with errors s, with the errors ε_z of mounts.
@@ -577,6 +571,46 @@ class HeadingFilter:
         heading, mount = self._columns["heading"], self._columns["mount"]
         cov, both = P[np.ix_(heading, heading)], P[np.ix_(heading, mount)]
         return x[heading], cov, cov + P[np.ix_(mount, mount)] + both + both.T
+
+
+def _list_hinges(
+    model: BodyModel, start_pose: StartPose, names: Sequence[str], calibrated: Mapping[str, Hinge]
+) -> list[tuple[HingeJoint, float, float, float]]:
+    """List the hinges between two sensors, each with three standard deviations [rad]: of its axis about the long axis
+    of the segment above, of its axis across, and of the angle between its plane and the segment below.
+
+    A `calibrated` axis is relative to the calibrated mounts and holds as long as they do.
+    """
+    hinges = list[tuple[HingeJoint, float, float, float]]()
+    for hinge in find_hinges(model, start_pose, names):
+        if (own := calibrated.get(hinge.name)) is not None:
+            hinge = hinge._replace(axis=start_pose.turn(hinge.on, own.axis), per_twist=own.per_twist or 0.0)
+            hinges.append((hinge, AXIS_STD, TILT_STD, own.std))
+        elif not model.table.is_mechanism:
+            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
+            hinges.append((hinge, axis_std, hinge.tilt_std, hinge.softness))
+    return hinges
+
+
+def _compute_start_covariance(
+    first: Recording, names: Sequence[str], subject: Subject, model: BodyModel, repeat_share: float
+) -> np.ndarray:
+    """Compute the covariance (k, k) [rad²] of the headings at the end of the start pose, by the pose."""
+    table = model.table
+    start_pose = StartPose(table=table, repeat_share=repeat_share)
+    var = np.array(
+        [
+            REFERENCE_START_STD**2
+            if name == table.reference
+            else compute_start_heading_var(first, name, subject, start_pose)
+            for name in names
+        ]
+    )
+    # Since W's x is where the torso faces, its turn is an error of all headings that it does not carry with it.
+    carried = [table.is_mechanism or model.find_trunk(name) in (None, table.reference) for name in names]
+    shares = TURN_VAR_SHARE * np.outer(np.logical_not(carried), np.logical_not(carried))
+    np.fill_diagonal(shares, 1.0)
+    return np.asarray(shares * np.minimum.outer(var, var))
 
 
 def _weigh_joint(misfit: np.ndarray, squares: float, H: np.ndarray, correlated_samples: float) -> float:
