@@ -596,16 +596,11 @@ def _compute_start_covariance(
     first: Recording, names: Sequence[str], subject: Subject, model: BodyModel, repeat_share: float
 ) -> np.ndarray:
     """Compute the covariance (k, k) [rad²] of the headings at the end of the start pose, by the pose."""
-    table = model.table
-    start_pose = StartPose(table=table, repeat_share=repeat_share)
-    var = np.array(
-        [
-            REFERENCE_START_STD**2
-            if name == table.reference
-            else compute_start_heading_var(first, name, subject, start_pose)
-            for name in names
-        ]
-    )
+    table, var = model.table, np.full(len(names), REFERENCE_START_STD**2)
+    for i, name in enumerate(names):
+        if name != table.reference:
+            start_pose = StartPose(table=table, repeat_share=repeat_share)
+            var[i] = compute_start_heading_var(first, name, subject, start_pose)
     # Since W's x is where the torso faces, its turn is an error of all headings that it does not carry with it.
     carried = [table.is_mechanism or model.find_trunk(name) in (None, table.reference) for name in names]
     shares = TURN_VAR_SHARE * np.outer(np.logical_not(carried), np.logical_not(carried))
