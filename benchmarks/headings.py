@@ -218,11 +218,11 @@ def measure_live_headings(minutes: float) -> Table:
             _, error, std = by_joint[joint]
             row = table.rows.setdefault(joint, {})
             row |= {way: np.degrees(rms(error)), f"{way}_by_std": rms(error / std)}
-    for begin, end in pairwise(np.arange(0.0, recording.time[-1] + EVERY_S, EVERY_S).tolist()):
+    for begin, end in pairwise(np.arange(0.0, recording.time[-1], EVERY_S).tolist()):
         row = {}
         for way, by_joint in errors.items():
             values = [error[(time >= begin) & (time < end)] for time, error, _ in by_joint.values()]
-            row[way] = np.degrees(rms(np.concatenate(values))) if len(values[0]) > SCORED_HZ * CHUNK_S else np.nan
+            row[way] = np.degrees(rms(np.concatenate(values)))
         table.rows[f"all, {begin / 60.0:.0f} to {end / 60.0:.0f} min"] = row
     return table
 
