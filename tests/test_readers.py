@@ -272,12 +272,18 @@ def test_sensors_with_clocks_of_their_own_come_to_one_time(own_rate: float, sens
 
 
 def test_a_sensor_that_ends_early_is_named(tmp_path: Path) -> None:
-    path = write(tmp_path, table_at(np.arange(1000) / 100.0), head=table_at(np.arange(600) / 100.0))
+    """Two of three last for 20 s; that one of these began 30 s before the others makes none of them late."""
+    path = write(
+        tmp_path,
+        table_at(np.arange(2000) / 100.0),
+        head=table_at(np.arange(600) / 100.0),
+        pelvis=table_at(np.arange(-3000, 2000) / 100.0),
+    )
     recording = load_session(path)
     (short,) = (each for each in recording.diagnostics if each.severity == "warning")
-    assert (short.code, short.place, short.value) == ("sensor-short", "head", pytest.approx(4.0))
+    assert (short.code, short.place, short.value) == ("sensor-short", "head", pytest.approx(14.0))
     path.write_text(path.read_text(encoding="utf-8").replace("[[0.5, 1.9]]", "[[7, 9]]"), encoding="utf-8")
-    with pytest.raises(BadPhase, match=r"outside the recording.* The head sensor measured from 0 s to 5.99 s only"):
+    with pytest.raises(BadPhase, match=r"outside the recording.* The head sensor measured only from 0 s to 5.99 s"):
         load_session(path)
 
 

@@ -19,7 +19,7 @@ from .intervals import check_time, find_runs, format_span
 from .limits import LONGEST_STEP_S, SHORTEST_STEP_S
 
 LONGEST_GAP_S = 0.05  # [s] of lost samples that are bridged silently
-MOST_MISSING_S = 2.0  # by which a sensor may begin later and end earlier than others without a warning
+MOST_MISSING_S = 5.0  # [s] by which a sensor may begin later and end earlier than most without a warning
 # Relative deviation of a step from the usual one that means an uneven clock or a lost row; devices jitter less.
 UNEVEN = 0.5
 # Relative deviation of the rate over 1 s or 10 s from its mean, apart from one sample's jitter, at which the rate is
@@ -157,10 +157,12 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     variant, off = ("uneven", uneven) if uneven > UNEVEN else ("changing", drift)
     facts["variant"] = variant if shared else "clocks"
     found = [Diagnostic("time-stamps-uneven", INFO, value=off if shared else None, facts=facts)]
-    earliest, latest = min(clock.time[0] for clock in distinct), max(clock.time[-1] for clock in distinct)
+    # Loggers are switched on one by one: one that begins long before the others makes none of them late.
+    usual_begin = np.quantile([clock.time[0] for clock in clocks.values()], 0.5, method="lower")
+    usual_end = np.quantile([clock.time[-1] for clock in clocks.values()], 0.5, method="higher")
     for name, clock in clocks.items():
         own: dict[str, float | str] = {"start": float(clock.time[0]), "end": float(clock.time[-1])}
-        missing_s = float((clock.time[0] - earliest) + (latest - clock.time[-1]))
+        missing_s = max(0.0, float(clock.time[0] - usual_begin)) + max(0.0, float(usual_end - clock.time[-1]))
         if missing_s > MOST_MISSING_S:
             found.append(Diagnostic("sensor-short", WARNING, name, missing_s, facts=own))
     return time, tuple(found)
