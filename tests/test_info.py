@@ -37,7 +37,9 @@ def table(names: str = "torso_gyr_{} torso_acc_{}", time: str = "time", sensor: 
     return pl.DataFrame(columns)
 
 
-def test_an_mvnx_with_all_its_segments(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_an_mvnx_with_all_its_segments(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = mvnx(tmp_path, turning(100))
     text = info(capsys, path)
     assert f"{path}: Xsens MVNX, orientations, no raw data" in text
@@ -53,6 +55,8 @@ def test_an_mvnx_with_all_its_segments(capsys: pytest.CaptureFixture[str], tmp_p
     text = info(capsys, path, "--write", "--force")  # aligned orientations can be tracked at once
     assert f"wepose track {tmp_path / 'session.toml'} -o result" in text
     assert "calibrate" not in text
+    monkeypatch.chdir(tmp_path)
+    assert "Session: session.toml  (" in info(capsys, path.name, "--write", "--force")
 
 
 def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

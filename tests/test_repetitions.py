@@ -134,6 +134,8 @@ def test_the_main_angle_is_that_of_the_largest_range_that_is_known() -> None:
     quat_WL |= dict.fromkeys(("left_upper_arm", "right_upper_arm"), np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1)))
     angles = wp.joint_angles(wp.Pose(np.arange(1000) / RATE, quat_WL, {}))
     assert find_repetitions(angles).source == "left_elbow_flexion"
+    angles["left_elbow"].values[500:, 2] += 2.0 * np.pi  # pronation: a motion once around the lock
+    assert find_repetitions(angles).source == "left_elbow_flexion"
     angles["left_elbow"].gap[:300] = True
     assert find_repetitions(angles).source == FLEXION
     angles["right_elbow"].gap[:] = True

@@ -71,6 +71,11 @@ def test_it_opens_offline_with_its_sections_and_five_figures_each_with_a_caption
     assert "@media screen and (prefers-color-scheme: dark)" in page
 
 
+def test_it_says_that_the_calibration_failed(result: wp.TrackResult) -> None:
+    failed = replace(result, subject=replace(result.subject, quality="fail"))
+    assert "; quality of the calibration: fail." in text_of(report(failed))
+
+
 def test_it_begins_with_what_can_be_relied_on(page: str, result: wp.TrackResult) -> None:
     """The usual ± of elbows and hands, and of what is least certain; the worst instant stands in the tables."""
     text = text_of(page)
@@ -170,7 +175,7 @@ def test_a_late_start_pose_and_what_came_before_it() -> None:
     """What comes before the start pose is in no figure, and the page says so."""
     late = elbow(90.0, start=(20.0, 24.0))
     assert the("start-pose-late", late).value == pytest.approx(20.0)
-    assert "the 24 s before its end are left out" in text_of(report(late))
+    assert "after the start pose, so the first 24 s are left out" in text_of(report(late))
 
 
 @pytest.mark.parametrize(("forward_deg", "aside_deg", "is_bad"), [(140.0, 0.0, 0), (-30.0, 0.0, 1), (90.0, 80.0, 1)])

@@ -55,14 +55,16 @@ def find_main_angle(angles: Angles) -> str | None:
 
     Of joints between two segments; of thorax and pelvis in W only where there are no others, for a person who turns
     round has the largest range there. An angle that is near gimbal lock, or in gaps, for longer is left out
-    (`MAX_NEAR_LOCK`, `MAX_GAP`). None where all are.
+    (`MAX_NEAR_LOCK`, `MAX_GAP`), and so is one between two segments that went once around its lock. None where all are.
     """
     ranges: dict[str, tuple[bool, float]] = {}
     for angle, (joint, k) in list_angles(angles).items():
         each, hidden = angles[joint], angles[joint].hidden(k)
         if np.mean(hidden & ~each.gap) <= MAX_NEAR_LOCK and np.mean(each.gap) <= MAX_GAP:
             low, high = np.percentile(each.values[~hidden, k], [2.0, 98.0])
-            ranges[angle] = (JOINTS[joint].proximal != "world", float(high - low))
+            between = JOINTS[joint].proximal != "world"
+            if not between or high - low < 2.0 * np.pi:
+                ranges[angle] = (between, float(high - low))
     return max(ranges, key=lambda angle: ranges[angle], default=None)
 
 

@@ -51,7 +51,7 @@ def info(
         progress("reading", 0.0)
         body = None if model is None else load_model(model).table
         file, beside = find_file(file, body)
-        session = out or file.absolute().parent / "session.toml"
+        session = out or file.parent / "session.toml"
         writes = write or out is not None
         description = describe_file(file, session.absolute().parent, body, None if model is None else Path(model))
         if writes:

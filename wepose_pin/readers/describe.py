@@ -313,7 +313,7 @@ def _propose_from_names(path: Path, folder: Path, body: BodyTable, content: Arra
     if any("gyro" in signals for signals in guess.sensors.values()):
         about.data["gyro_unit"] = guess.units.get("gyro", "rad/s")
         if "gyro" not in guess.units:
-            about.checks["gyro_unit"] = "neither the file nor the motion shows the unit"
+            about.checks["gyro_unit"] = "assumed, as the file states no unit; the motion does not contradict it"
         about.data["accel_unit"] = guess.units.get("accel", "m/s^2")
     for segment, signals in guess.sensors.items():
         about.sensors[segment] = {name: own if len(own) > 1 else own[0] for name, own in signals.items()}

@@ -9,6 +9,7 @@ from ..angles import summary as summarize_angles
 from ..body import BodyTable
 from ..body.kinematics import compute_axis_std
 from ..recording import format_span
+from ..recording.plausibility import GRAVITY_ERROR_NOTED
 from ..tracking import TrackResult, TrackSummary
 from ..tracking import summary as measures
 from . import figures as fig
@@ -53,10 +54,11 @@ def render_track_report(summary: TrackSummary, reliance: str, angles: Angles | N
 def _describe_recording(tracked: TrackResult) -> str:
     recording, time = tracked.recording, tracked.time
     mounts = "as the session states them" if measures.has_stated_mounts(tracked) else "as calibrated"
+    quality = f"; quality of the calibration: {tracked.subject.quality}" if tracked.subject.quality else ""
     text = (
         f"{recording.time[-1] - recording.time[0]:.0f} s at {recording.rate_hz:g} Hz from {len(recording.sensors)} "
         f"sensors, {tracked.options['method'] if recording.imus else 'measured orientations'}. Lengths: "
-        f"{plain(tracked.subject.note or tracked.subject.name)}; mounts {mounts}. ± is one standard deviation "
+        f"{plain(tracked.subject.note or tracked.subject.name)}; mounts {mounts}{quality}. ± is one standard deviation "
         "throughout: two times out of three the truth lies within."
     )
     if tracked.subject.is_population and not tracked.model.table.is_mechanism:
@@ -68,7 +70,7 @@ def _describe_recording(tracked: TrackResult) -> str:
         )
     before = float(time[np.argmax(measures.find_samples_after_start(tracked))] - time[0])
     if before >= 1.0:
-        text += f" Each ± is of the time after the start pose; the {before:.0f} s before its end are left out."
+        text += f" Each ± is taken after the start pose, so the first {before:.0f} s are left out."
     return text
 
 
@@ -100,7 +102,8 @@ def _list_recorded(tracked: TrackResult, summary: TrackSummary) -> list[Item]:
         Table("", [*header, "bias at first", "bias at the end", "gravity"], rows),
         "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
         "sensor is static its gyroscope measures its bias, and the heading does not drift. An error of 0.1 °/s in the "
-        "bias rotates the heading by 6° in a minute. Gravity should measure 9.81 m/s², to 2 %.",
+        "bias rotates the heading by 6° in a minute. Gravity should measure 9.81 m/s², to "
+        f"{100 * GRAVITY_ERROR_NOTED:.0f} %.",
     ]
 
 
