@@ -353,10 +353,10 @@ _Stretches = dict[str, dict[str, np.ndarray]]
 def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretches]:
     """Link, and joint, → length → P (3, 3): S_W = 1 + Σ (ratio − 1) P stretches it, all joints at zero.
 
-    What stretches with a segment are the links from its own down to the next segments, to one of the spine also the
-    spine below it, down to the next segment or the root, which keep their shape.
+    What stretches with a segment are the links from its own down to the next segments, and with one of the spine also
+    the spine below it, down to the next segment or the root, across what stretches these already.
     """
-    lines, of_links, of_joints = _find_lines(tree, table), _Stretches(), _Stretches()
+    lines, of_links, of_joints, of_spines = _find_lines(tree, table), _Stretches(), _Stretches(), list[Any]()
     links_of = {name: segment.link for name, segment in table.segments.items()}
     starts: dict[str, str] = {}  # segment → its uppermost link, or its own where a segment above is rigid with it
     for name in sorted(links_of, key=lambda name: len(tree.path(links_of[name]))):
@@ -377,10 +377,16 @@ def _find_stretches(tree: Tree, table: BodyTable) -> tuple[_Stretches, _Stretche
         links = tree.hanging(starts[segment], starts.values())
         spine = tree.path(starts[segment]) if own.spine else []
         spine = spine[max((k for k, joint in enumerate(spine) if joint.parent in starts.values()), default=0) :]
-        links += [joint.parent for joint in spine[1:]]
         of_links |= dict.fromkeys(links, parts)
         of_joints |= {joint.name: parts for link in links for joint in tree.below[link]}
-        of_joints |= {joint.name: parts for joint in spine[:1]}
+        links = [joint.parent for joint in spine[1:]]
+        joints = {joint.name for link in links for joint in tree.below[link]} | {joint.name for joint in spine[:1]}
+        of_spines += [(of_links, links, parts), (of_joints, joints, parts)]
+    for stretches, names, parts in of_spines:
+        for name in names:
+            before = stretches.get(name, {})
+            across = np.eye(3) - sum(before.values())
+            stretches[name] = before | {length: P @ across for length, P in parts.items()}
     return of_links, of_joints
 
 

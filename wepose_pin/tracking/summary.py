@@ -28,7 +28,7 @@ PERIOD_S = 1.0  # [s] from one sample of the error budget to the next
 SOURCES = ("soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle")  # of the error budget
 MOST_SAMPLES = 50_000  # that pages show; a longer recording is decimated to fewer than twice as many
 # Limits of the diagnostics
-MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
+MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment, if its ± is not larger
 BIAS_LARGE = np.deg2rad(3.0)  # [rad/s] on an axis; data sheets allow 0.5 to 3 deg/s
 LITTLE_STATIC, LONG_MOTION_S = 0.02, 120.0
 LATE_START_S = 10.0
@@ -236,8 +236,10 @@ class TrackSummary:
             facts = {"variant": "joints", "joints": ", ".join(self.undetermined_joints)}
             yield Diagnostic("sensors-missing", WARNING, facts=facts)
         for segment, rms in self.residual_rms.items():
-            if rms > MOST_RESIDUAL:
-                yield Diagnostic("orientation-residual", WARNING, segment, rms, MOST_RESIDUAL)
+            cov = self.tracked.pose.segment_cov.get(segment, np.zeros((1, 3, 3)))
+            limit = max(MOST_RESIDUAL, float(np.sqrt(np.trace(cov, axis1=1, axis2=2).mean())))
+            if rms > limit:
+                yield Diagnostic("orientation-residual", WARNING, segment, rms, limit)
         for name in self.signals:
             yield from self._diagnose_signal(name)
         yield from self._diagnose_headings()
