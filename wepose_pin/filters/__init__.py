@@ -87,6 +87,7 @@ class SensorFilters:
     params : the filter's own; None: its defaults, with the tilt of the start phase as it is known
     static_test : when a sensor counts as static; "smekf_published" uses conditions (1) to (4) alone, the paper's
     start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
+    drifts : whether the covariance contains the drift of the heading in motion, which a heading filter knows by itself
 
     Attributes
     ----------
@@ -103,8 +104,9 @@ class SensorFilters:
         params: Any = None,
         static_test: StaticTest | None = None,
         start: slice | None = None,
+        drifts: bool = False,
     ) -> None:
-        self._filter, self._params, self._start = METHODS[method], params, start
+        self._filter, self._params, self._start, self._drifts = METHODS[method], params, start, drifts
         self._is_offline, self._test = method in OFFLINE, static_test or USUAL_TEST
         if self._filter is PUBLISHED_SMEKF:
             self._test = replace(self._test, rate_stds=np.inf)
@@ -162,7 +164,8 @@ class SensorFilters:
         if self._start is None:  # the sensor may move there
             tilt_std = MOVING_TILT_STD
         if params is None and filter_.params_type is not None:
-            params = filter_.params_type(**{"tilt_std": tilt_std} if filter_.has_covariance else {})
+            known = {"tilt_std": tilt_std} | ({} if self._drifts else {"drift_rate_std": 0.0})
+            params = filter_.params_type(**known if filter_.has_covariance else {})
         if gyro_range < getattr(params, "gyro_range", -np.inf):
             params = replace(params, gyro_range=gyro_range)
         static_records, first = make_static_records(noise, rate_hz, self._test), int(phase.start)
@@ -226,7 +229,8 @@ def estimate_orientation(
     of other sensors (`track` aligns them by the start pose). At the first sample of the static phase the heading is
     zero and the tilt is that of the mean accelerometer over the phase (without a phase: over the first window of
     `static_test`); the filter goes forward and backward in time from there. Where `gyro_S` is at the limit of the
-    sensor's range, `attitude_cov` grows by the rotation that may have gone unmeasured.
+    sensor's range, `attitude_cov` grows by the rotation that may have gone unmeasured. In motion the heading drifts by
+    more than the bias explains, which `attitude_cov` contains (`drift_rate_std` of the parameters).
 
     Parameters
     ----------
@@ -314,5 +318,6 @@ def estimate_orientation(
         noise = estimate_noise(gyro[start], accel[start], rate_hz)
         if (rate_deg_s := float(np.degrees(np.sqrt(np.trace(noise.gyro_cov))))) > MOVES_DEG_S:
             raise BadPhase(f"static = {static} [s]: the sensor turns at {rate_deg_s:.0f} deg/s rms; name other seconds")
-    filters = SensorFilters({"": noise}, method=method, params=params, static_test=static_test, start=start)
+    options = {"params": params, "static_test": static_test, "start": start}
+    filters = SensorFilters({"": noise}, method=method, drifts=True, **options)
     return filters.push(Recording("", np.empty(len(gyro)), rate_hz, {"": sensor}))[""]._replace(diagnostics=diagnostics)

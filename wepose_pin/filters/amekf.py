@@ -87,6 +87,7 @@ class AmekfParams(base.FilterParams):
     impact: Positive = 100.0  # [m/s²] beyond it is an impact: the excess, integrated, is a velocity error
     tilt_std: NonNegative = 0.2  # [rad] at the start, which may be in motion
     gyro_matrix_std: NonNegative = 0.002  # each entry of M
+    drift_rate_std: NonNegative = base.DRIFT_RATE_STD  # [rad/s]
     gyro_bias_walk: NonNegative = 5e-5  # [rad/s/√s], 100 deg/h in 100 s: it changes with motion too
     static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg
@@ -320,7 +321,8 @@ def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out
             blocks[row] = state.block
             row += 1
         attitude = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2], P[2, 0], P[2, 1], P[2, 2]
-        base.into_sensor(state.R_VS, attitude, state.lost_rotation_var, 0.0, out_cov[k])
+        state.moved_s += model.dt * (not static[k])
+        base.into_sensor(state.R_VS, attitude, state.lost_rotation_var, model.drift_var * state.moved_s**2, out_cov[k])
         for i in range(4):
             out_quat[k, i] = state.quat_VS[i]
         for i in range(3):
@@ -343,6 +345,7 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
         about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
         last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
         lost_s=0.0,  # [s] the same
+        moved_s=0.0,  # [s] in motion since the start
         # sums over the samples of the open block
         samples=np.int64(0),
         static_samples=np.int64(0),
@@ -385,6 +388,7 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
         rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
         force_error_var=p.force_noise**2,  # [1] of the summed |acceleration| of a block
         lost_accel_var=p.lost_force_std**2,  # [m²/s⁴]
+        drift_var=p.drift_rate_std**2,  # [rad²/s²]
         gyro_range=p.gyro_range,  # [rad/s]
         impact_limit=p.impact,  # [m/s²]
     )

@@ -12,10 +12,13 @@ from ..arguments import check_fields
 from ..compilation import fma, inlined
 from ..diagnostics import Diagnostic
 from ..recording.limits import HIGHEST_RATE_SQUARED
-from .phases import SensorNoise
+from .phases import ACCEL_BIAS_STD, SensorNoise
 
 # [rad/√s] by which a static sensor may rotate about the vertical undetected: 0.01 deg/s for 10 s at a time
 STATIC_TURN_NOISE = 8e-4
+# [rad/s] at which a heading drifts in motion, though the bias at rest is known: with it the errors on BROAD and on a
+# UR5 arm are as large as stated
+DRIFT_RATE_STD = float(np.deg2rad(0.03))
 START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so that P can be inverted
 
 # While the gyroscope is lost (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant
@@ -25,6 +28,8 @@ START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so 
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 MOST_LOST_STD = np.pi / np.sqrt(3.0)  # [rad] of an angle of which nothing is known
+
+TILT_VAR = ACCEL_BIAS_STD**2  # [rad²] by the bias of the accelerometer, in each static phase the same
 
 # Columns of `Orientation.about_vertical`
 HEADING, RATE, RATE_VAR = range(3)
@@ -161,8 +166,8 @@ def add_lost(variance, lost_var):  # type: ignore[no-untyped-def]
 
 @inlined
 def into_sensor(R, P, more, more_heading, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (3, 3) with ``Rᵀ (P + more_heading e_z e_zᵀ) R + more I``; `R` (3, 3), `P` (9,) symmetric."""
-    xx, xy, xz, yy, yz, zz = P[0], P[1], P[2], P[4], P[5], P[8] + more_heading
+    """Fill `out` (3, 3) with ``Rᵀ (P + diag(TILT_VAR, TILT_VAR, more_heading)) R + more I``; `R` (3, 3), `P` (9,)."""
+    xx, xy, xz, yy, yz, zz = P[0] + TILT_VAR, P[1], P[2], P[4] + TILT_VAR, P[5], P[8] + more_heading
     for i in range(3):
         a, b, c = R[0, i], R[1, i], R[2, i]
         u, v, w = fma(xx, a, fma(xy, b, xz * c)), fma(xy, a, fma(yy, b, yz * c)), fma(xz, a, fma(yz, b, zz * c))

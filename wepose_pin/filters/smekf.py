@@ -1,9 +1,11 @@
 """sMEKF: the multiplicative Kalman filter that corrects in static phases alone (Lisini Baldi 2019, Algorithm 1).
 
-One thing differs from the paper, which works to first order (`_run_published`). Its transition Φ = I − [ω δt]× lets the
+Two things differ from the paper, which works to first order (`_run_published`). Its transition Φ = I − [ω δt]× lets the
 standard deviation grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s. Its corrections rotate
 the attitude and not the covariance, so that static phases seem to measure the heading. Over two minutes of simulated
 motion with static phases the rms heading error is 0.57 deg as published and 0.10 deg here.
+
+What static phases do not show of the gyroscope, its scale and misalignment, adds to the noise in motion.
 
 The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s] in S. The paper's a is in S, on the
 right of `quat_VS`. Here it is in V, on the left, where neither the sensor's rotation nor a correction of the attitude
@@ -34,6 +36,8 @@ class SmekfParams(base.FilterParams):
     tilt_std: NonNegative = ACCEL_BIAS_STD  # [rad] of roll and pitch at the start
     static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical
     gyro_scale_std: NonNegative = 0.002  # of the gyroscope's scale, which no static phase shows
+    rate_noise: NonNegative = 2e-3  # [1/√Hz] of gyro in motion, a fraction of |ω|
+    drift_rate_std: NonNegative = base.DRIFT_RATE_STD  # [rad/s]
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
 
 
@@ -88,13 +92,13 @@ def _scale(s, u):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _predict(A, C, B, R, model):  # type: ignore[no-untyped-def]
+def _predict(A, C, B, R, wx, wy, wz, model):  # type: ignore[no-untyped-def]
     """Algorithm 1, prediction: P ← F P Fᵀ + Q with F = [[I, −δt R_VS], [0, I]]."""
     F = _scale(-model.dt, R[0]) + _scale(-model.dt, R[1]) + _scale(-model.dt, R[2])
     A = _add_product(A, F, _transpose(C))
     C = _add_product(C, F, B)
     A = _symmetric(_add_product(A, C, _transpose(F)))
-    more, more_bias = model.attitude_var, model.bias_var
+    more, more_bias = fma(model.rate_noise_var, wx * wx + wy * wy + wz * wz, model.attitude_var), model.bias_var
     return _add_diagonal(A, more, more, more), C, _add_diagonal(B, more_bias, more_bias, more_bias)
 
 
@@ -144,7 +148,7 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         wx, wy, wz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
         rotate_by_vector(quat, wx * dt, wy * dt, wz * dt)
         fill_matrix(quat, R)
-        A, C, B = _predict(A, C, B, R, model)
+        A, C, B = _predict(A, C, B, R, wx, wy, wz, model)
         if lost_var > 0.0:
             x, y, z = base.add_lost(A[0], lost_var), base.add_lost(A[4], lost_var), base.add_lost(A[8], lost_var)
             A = x, A[1], A[2], A[3], y, A[5], A[6], A[7], z
@@ -153,7 +157,8 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         # A scale of the gyroscope that is wrong by s gives the heading an error of s times the rotation about the
         # vertical. The scale is no part of the filter's state, as in the paper.
         state.turned += dt * (R[2, 0] * wx + R[2, 1] * wy + R[2, 2] * wz)
-        base.into_sensor(R, A, 0.0, model.scale_var * state.turned * state.turned, out_cov[k])
+        state.moved_s += dt * (not static[k])
+        base.into_sensor(R, A, 0.0, model.scale_var * state.turned**2 + model.drift_var * state.moved_s**2, out_cov[k])
         x, y, z = R[2, 0], R[2, 1], R[2, 2]
         vertical[base.RATE_VAR] = fma(x, fma(B[0], x, 2.0 * fma(B[1], y, B[2] * z)), y * fma(B[4], y, 2.0 * B[5] * z))
         vertical[base.RATE_VAR] += B[8] * z * z
@@ -174,6 +179,7 @@ def _make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Sm
         gyro_bias=noise.gyro_bias,  # (3,) [rad/s]
         P=P,  # A, C, B of a in V [rad] and b in S [rad/s]
         turned=0.0,  # [rad] net rotation about the vertical since the start
+        moved_s=0.0,  # [s] in motion since the start
         last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
         lost_s=0.0,  # [s] the same
         about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
@@ -185,11 +191,13 @@ def _make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Sm
         dt=1.0 / rate_hz,  # [s]
         inverse_gravity=1.0 / noise.gravity,  # [s²/m]
         attitude_var=gyro_var / rate_hz**2,  # [rad²] of a sample
+        rate_noise_var=p.rate_noise**2 / rate_hz,  # [s²] of a sample
         bias_var=step_var / rate_hz**2,  # [rad²/s²] of a sample
         static_gyro_var=gyro_var + noise.sway_density(rate_hz) * rate_hz,  # [rad²/s²]
         static_accel_var=accel_var + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz,  # [1]
         static_turn_var=p.static_turn_noise**2 / rate_hz,  # [rad²] of a sample
         scale_var=p.gyro_scale_std**2,
+        drift_var=p.drift_rate_std**2,  # [rad²/s²]
         gyro_range=p.gyro_range,  # [rad/s]
     )
     return state, model

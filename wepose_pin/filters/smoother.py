@@ -61,15 +61,18 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, quat, bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
+def _interpolate(  # type: ignore[no-untyped-def]
+    blocks, deviation, cov, bias_cov, start_trace, models, static, quat, bias, attitude_cov, about_vertical
+):
     """Correct the filter's run in place, sample by sample, between the corrections of its block's ends.
 
     They are taken in proportion to the time, or, where gyro was lost, to the variance of the turn that was lost up to
     the sample; of that and the variance from there to the end, the product over the sum is left, as in any bridge.
-    `size`: samples of a block.
     """
-    R, P, e = np.empty((3, 3)), np.empty(9), np.empty(COUNT)
+    R, P, e, moved = np.empty((3, 3)), np.empty(9), np.empty(COUNT), 0
+    size = models[0].block_samples
     for k in range(len(quat)):
+        moved += not static[k]
         row = k // size
         end = min(row + 1, len(blocks))  # the last block may not be full: nothing was corrected in it
         whole = k % size + 1 == size  # the filter has corrected this sample
@@ -94,7 +97,7 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, quat, bias
         for c in range(3):
             bias[k, c] += e[3 + c]
         fill_matrix(quat[k], R)
-        into_sensor(R, P, bridge, 0.0, attitude_cov[k])
+        into_sensor(R, P, bridge, models[0].drift_var * (models[0].dt * moved) ** 2, attitude_cov[k])
         # Smoothed headings and biases know the whole recording from the first sample on: nothing is corrected later.
         about_vertical[k, HEADING] = about_vertical[k, RATE] = variance = 0.0
         for i in range(3):
@@ -106,10 +109,11 @@ def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, quat, bias
 def _smooth(states: np.ndarray, models: np.ndarray, *arrays: np.ndarray) -> None:
     """Smooth a whole recording; each call starts anew, so that a recording cut in two is two recordings."""
     P_rows, size = states["P"][0, list(SMOOTHED_STATES), :STATES], int(models["block_samples"][0])
-    blocks = np.empty(len(arrays[0]) // size, BLOCK)
-    amekf.run(states.copy(), models, blocks, *arrays)
+    blocks, forward = np.empty(len(arrays[0]) // size, BLOCK), models.copy()
+    forward["drift_var"] = 0.0
+    amekf.run(states.copy(), forward, blocks, *arrays)
     smoothed = _backward(blocks, P_rows, float(models["gravity"][0]))
-    _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), size, *arrays[3:])
+    _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), models, *arrays[2:])
 
 
 SMOOTHER = OrientationFilter(amekf.make_records, _smooth, amekf.AmekfParams)

@@ -13,7 +13,6 @@ from ..body.mounts import StartPose, compute_start_heading_var, find_mount_covar
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..filters import Orientation
-from ..filters.phases import ACCEL_BIAS_STD
 from ..recording import Recording
 
 
@@ -54,7 +53,7 @@ def compute_segment_covariance(
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left, without soft tissue.
 
-    It is the sum of the filter's, the tilt by the accelerometer's bias, and the uncertainty of mount and start pose.
+    It is the sum of the filter's and of the uncertainty of mount and start pose.
 
     Parameters
     ----------
@@ -70,8 +69,6 @@ def compute_segment_covariance(
     quat_WV = rotations.rotation_about(vertical, heading_offset)
     R = Rotation.from_quat(rotations.multiply(quat_WV, quat_VS)).as_matrix()
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
-    # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
-    cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
     # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
     # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
     R_WL = R @ start_pose.to_world(segment, R_LS).inv().as_matrix()

@@ -190,7 +190,11 @@ class Tracker:
         sways = not self._body.table.is_mechanism
         self._start, self._static_phase, noises, diagnostics = find_reference_phases(first, sways)
         self._filters = SensorFilters(
-            noises, method=self._method, static_test=self._static_test, start=first.span(self._start)
+            noises,
+            method=self._method,
+            static_test=self._static_test,
+            start=first.span(self._start),
+            drifts=bool(self.options["open_loop"]),
         )
         orientation = self._filters.push(first)
         R_VS_start = average_start(first, collect_orientations(first, orientation), self._start)
