@@ -26,6 +26,7 @@ from wepose_pin import (
 )
 from wepose_pin.body.configuration import compute_pose
 
+ROOT = Path(__file__).resolve().parents[1]
 THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
 SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")
 
@@ -144,6 +145,24 @@ def test_its_result_is_read_exported_and_evaluated(tracked: TrackResult, tmp_pat
         f"{side}_{p}" for side in ("left", "right") for p in ("knee", "ankle", "toe")
     }
     assert max(error.worst for error in errors.position_on_limb.values()) < 0.01
+
+
+def test_a_waist_above_the_hips_is_there_in_a_bvh(tmp_path: Path) -> None:
+    pybvh = pytest.importorskip("pybvh")
+    text = (ROOT / "urdf" / "whole_body.urdf").read_text(encoding="utf-8")
+    for parent, child, new, origin in (("root", "torso", "pelvis", "0 0 0.1"), ("torso", "pelvis", "root", "0 0 0")):
+        joint = '<parent link="{}"/><child link="{}_x_link"/><origin xyz="{}"/>'
+        text = text.replace(joint.format(parent, child, "0 0 0"), joint.format(new, child, origin))
+    (tmp_path / "high.urdf").write_text(text, encoding="utf-8")
+    body = load_model(tmp_path / "high.urdf")
+    quat_WL = {segment: np.tile([0.0, 0.0, 0.0, 1.0], (9, 1)) for segment in body.table.segments}
+    quat_WL["pelvis"] = Rotation.from_rotvec(np.linspace(0.0, 1.0, 9)[:, None] * [0.3, 0.8, 0.5]).as_quat()
+    pose = compute_pose(body, np.arange(9) / 50.0, quat_WL)
+    export(TrackResult("high", pose, body, Subject("high", {}, (), np.zeros((0, 0)))), tmp_path / "x.bvh")
+    read = pybvh.read_bvh_file(tmp_path / "x.bvh")
+    placed = dict(zip((node.name for node in read.nodes), read.node_positions().swapaxes(0, 1), strict=True))
+    for joint, point in {"LeftUpLeg": "left_hip", "LeftArm": "left_shoulder"}.items():
+        np.testing.assert_allclose(placed[joint], 100.0 * pose.points[point][:, [1, 2, 0]], atol=1e-4)
 
 
 # A robot --------------------------------------------------------------------------------------------------------------

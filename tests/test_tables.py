@@ -152,7 +152,7 @@ def test_a_link_without_a_segment_on_the_way_says_so(folder: Path, capsys: pytes
     (folder / "bad.toml").write_text(GOOD.replace('shoulder_link = "shoulder_link"', 'shoulder_link = "base_link"'))
     model = ("--model", folder / "bad.toml", "--protocol", "tip")
     line = refuse(capsys, "calibrate", folder, *model, "-o", folder / "out")
-    for part in ("session.toml", "shoulder_pan_joint", "the place of tip is not known"):
+    for part in ("session.toml", "a sensor behind joint shoulder_pan_joint", "the place of tip is not known"):
         assert part in line
 
 

@@ -148,8 +148,9 @@ class PointPath:
                 carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
                 if carrier is None:
                     places = " and ".join(point for point, _ in points)
+                    what = "sensors." if link in model.table.segments else "a segment with a sensor behind joint "
                     raise BadSession(
-                        f"{where}sensors.{link} is missing: without it the place of {places} is not known; add it, or "
+                        f"{where}{what}{link} is missing: without it the place of {places} is not known; add it, or "
                         f"use a protocol without that point, or another body (`model`)"
                     )
                 (B, c), R = sums.get(carrier, zero), start.rotation(link)

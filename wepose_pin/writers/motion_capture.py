@@ -65,7 +65,9 @@ def write_bvh(path: Path, motion: TrackResult) -> list[Diagnostic]:
     p_W = np.zeros((len(motion.time), 3))  # of the hips
     if anchors and set(anchors) <= set(motion.points) and not table.girdles:  # a spine without sensors may bend
         p_W = np.mean([motion.points[point] for point in anchors], axis=0)
-        p_W = p_W - Rotation.from_quat(motion.quat_WL[table.reference]).apply(root.end)
+        spine = root.children[0]
+        p_W = p_W - Rotation.from_quat(motion.quat_WL[table.reference]).apply(spine.end - spine.at)
+        p_W = p_W - Rotation.from_quat(motion.quat_WL[root.segment]).apply(spine.at)
     columns = [100.0 * _to_file_axes(p_W), *_compute_angles(motion, root, None)]
     lines = ["HIERARCHY", *_format_hierarchy(root, root.at, 0), "MOTION"]
     lines += [f"Frames: {len(columns[0])}", f"Frame Time: {1.0 / motion.rate_hz:.8f}"]
@@ -83,7 +85,7 @@ def _build_skeleton(motion: TrackResult, anchors: Sequence[str]) -> Bone:
     links = [*table.segments, *(model.point_frames[point] for point in known)]
     p_W = compute_link_poses(model, q, links, rotations=False)[1][0]
     starts, points = dict(zip(table.segments, p_W, strict=False)), dict(zip(known, p_W[count:], strict=True))
-    hips = next((segment for segment in table.segments if NAMES.get(segment) == ROOT), None)
+    hips, zero = next((segment for segment in table.segments if NAMES.get(segment) == ROOT), None), np.zeros(3)
 
     def find_end(segment: str, at: np.ndarray, above_at: np.ndarray) -> np.ndarray:
         """Find where the bone of a segment ends (3,) [m]."""
@@ -101,13 +103,12 @@ def _build_skeleton(motion: TrackResult, anchors: Sequence[str]) -> Bone:
         own = segment if segment in measured else above if rigid else None
         if own is None:
             return None
-        at = np.zeros(3) if segment == table.reference else starts[segment]
+        at = zero if segment == table.reference and hips not in measured else starts[segment]
         below = [s for s, parent in model.parents.items() if parent == segment and s != hips]
         children = [bone for s in below if (bone := hang(s, own, at)) is not None]
         name = NAMES.get(segment) or "".join(word.capitalize() for word in segment.split("_"))
         return Bone(name, own, at, children, find_end(segment, at, above_at))
 
-    zero = np.zeros(3)
     on_hips = [s for s, parent in model.parents.items() if parent is None or parent == hips]
     bones = [bone for s in on_hips if s != hips and (bone := hang(s, None, zero)) is not None]
     return Bone(ROOT, hips if hips is not None and hips in measured else table.reference, zero, bones, bones[0].end)
