@@ -132,25 +132,25 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
 
 
 @inlined
-def _add(sums, before, block, at, anchor):  # type: ignore[no-untyped-def]
-    """Fill `sums` with `before` and sample `at` of the block; both may be one."""
+def _add(sums, before, sample, anchor):  # type: ignore[no-untyped-def]
+    """Fill `sums` with `before` and a sample; both may be one."""
     for part in range(2):
         k, m = 3 * part, 7 + 6 * part
-        x, y, z = block[at, k] - anchor[k], block[at, k + 1] - anchor[k + 1], block[at, k + 2] - anchor[k + 2]
+        x, y, z = sample[k] - anchor[k], sample[k + 1] - anchor[k + 1], sample[k + 2] - anchor[k + 2]
         sums[k], sums[k + 1], sums[k + 2] = before[k] + x, before[k + 1] + y, before[k + 2] + z
         sums[m], sums[m + 1], sums[m + 2] = before[m] + x * x, before[m + 1] + x * y, before[m + 2] + x * z
         sums[m + 3], sums[m + 4], sums[m + 5] = before[m + 3] + y * y, before[m + 4] + y * z, before[m + 5] + z * z
-    norm = block[at, 6] - anchor[6]
+    norm = sample[6] - anchor[6]
     sums[6], sums[19] = before[6] + norm, before[19] + norm * norm
 
 
 @inlined
-def _is_far(anchor, limit, block, at):  # type: ignore[no-untyped-def]
-    """Return whether gyro at a sample is too far from the anchor for any static window with both.
+def _is_far(anchor, limit, sample):  # type: ignore[no-untyped-def]
+    """Return whether gyro of a sample is too far from the anchor for any static window with both.
 
     Two samples that differ by d make (N − 1) S ≥ d²/2; twice the limit is beyond rounding. NaN is not far.
     """
-    x, y, z = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
+    x, y, z = sample[0] - anchor[0], sample[1] - anchor[1], sample[2] - anchor[2]
     return x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
 
 
@@ -221,30 +221,30 @@ def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ign
     """Add a sample; return where the window begins in the block before, or −1 where it is not full or surely moves."""
     at, anchor, head, limit = state.samples, state.anchor, state.head, model.limits[0]
     ax, ay, az = ax * model.inverse_gravity, ay * model.inverse_gravity, az * model.inverse_gravity
-    norm = np.sqrt(ax * ax + ay * ay + az * az)
-    block[at, 0], block[at, 1], block[at, 2], block[at, 6] = gx, gy, gz, norm
-    block[at, 3], block[at, 4], block[at, 5] = ax, ay, az
+    sample = gx, gy, gz, ax, ay, az, np.sqrt(ax * ax + ay * ay + az * az)
+    for m in range(SIGNALS):
+        block[at, m] = sample[m]
     state.samples = at + 1
     if state.samples < len(block):
         if not state.moves:
-            state.moves = _is_far(anchor, limit, block, at)
-            _add(head, head, block, at, anchor)
+            state.moves = _is_far(anchor, limit, sample)
+            _add(head, head, sample, anchor)
             # No window needs the sums of the block before from here; those up to here serve condition (6).
             tail[at, 0], tail[at, 1], tail[at, 2] = head[0], head[1], head[2]
         return -1 if state.moves or state.samples <= state.moves_until else state.samples
     # The block is full and is the window: sum it up backwards, begin the next.
-    if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
+    if (gx + gy + gz + sample[6]) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
         for m in range(SIGNALS):
-            anchor[m] = block[at, m]
+            anchor[m] = sample[m]
     for m in range(SUMS):
         head[m] = 0.0
-    _add(tail[at], head, block, at, anchor)
+    _add(tail[at], head, sample, anchor)
     state.moves, state.moves_until, state.samples = False, -1, 0
     for before in range(at - 1, -1, -1):
-        if _is_far(anchor, limit, block, before):
+        if _is_far(anchor, limit, block[before]):
             state.moves_until = before
             return -1
-        _add(tail[before], tail[before + 1], block, before, anchor)
+        _add(tail[before], tail[before + 1], block[before], anchor)
     return 0
 
 

@@ -110,6 +110,9 @@ def check_sensors(
 
 def check_arrays(place: str, rate_hz: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """Raise `BadData` where a sensor does not measure; `samples`: sensor → gyro and accel (n, 3), all numbers."""
+    step = max(1, int(FROZEN_S * rate_hz / FROZEN_SAMPLES))  # the shortest fault shows in so many rows
+    if not any(_ends_with_dead_axis(each) or _may_stand(each, step) for arrays in samples.values() for each in arrays):
+        return
     times = {name: (np.arange(len(arrays[0])) / rate_hz, *arrays) for name, arrays in samples.items()}
     for name, (fault, *_) in find_faults(times).items():
         text = f"{place}{name}{': ' * bool(name)}{fault.describe(max(fault.first, 0.0))}"
@@ -175,7 +178,7 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
 
 def _find_dead_axis(time: np.ndarray, signal: np.ndarray, accel_S: np.ndarray) -> tuple[int, int] | None:
     """Find an axis of a signal (n, 3) that never changes from a row on, while the sensor moves; return both."""
-    if not (signal[-DEAD_ROWS - 1 :] == signal[-1]).all(axis=0).any():
+    if not _ends_with_dead_axis(signal):
         return None
     differs = np.vstack([np.ones(3, dtype=bool), signal[:-1] != signal[-1]])
     begins = len(time) - 1 - np.argmax(differs[::-1], axis=0)  # rows from which the axes have their last values
@@ -190,6 +193,22 @@ def _find_dead_axis(time: np.ndarray, signal: np.ndarray, accel_S: np.ndarray) -
     # Noise below a digit turns by single digits: then an axis that hardly moves stands, too.
     is_noisy = _is_noisy(time[row:], signal[row:] * np.minimum(1.0, np.sqrt(ROUNDING_TURN / 1.5) / digit))
     return (axis, row) if is_noisy else None
+
+
+def _ends_with_dead_axis(signal: np.ndarray) -> bool:
+    """Return whether an axis of a signal (n, 3) does not change in the last rows."""
+    return bool((signal[-DEAD_ROWS - 1 :] == signal[-1:]).all(axis=0).any())
+
+
+@kernel
+def _may_stand(signal, step):  # type: ignore[no-untyped-def]
+    """Return whether `FROZEN_SAMPLES` rows of a signal (n, k) at intervals of `step` are the same."""
+    repeats = 0
+    for row in range(step, len(signal), step):
+        repeats = repeats + 1 if is_same(signal[row - step], signal[row]) else 0
+        if repeats == FROZEN_SAMPLES - 1:
+            return True
+    return False
 
 
 @compiled
