@@ -16,8 +16,7 @@ HEAD = """# Troubleshooting
 Look a message up here by its words or by its code: what is wrong, and **what to do**. The message also
 says why it matters. Its severity is *info* (good to know), *warning* (results may be wrong or uncertain) or
 *error* (do not use the results). `summary.json` and `calibration.json` hold all messages of a result under
-`diagnostics`, with code, place, value and limit in SI units. The numbers here are examples; ± is one
-standard deviation. Words: [glossary](glossary.md).
+`diagnostics`, with code, place, value and limit in SI units. The values here are examples.
 
 `python docs/diagnostics_page.py` writes this page from `wepose_pin/diagnostics.toml`.
 """

@@ -4,7 +4,7 @@ Each setting had its own search, so that no filter runs with gains of another ki
 over trials of the total RMSE over the motion, which the experiments report too; heading, bias, noise and initial tilt
 were those of the static phase. Each half of BROAD is run with the gains of the other half, and other recordings with
 those of all of it. The drift experiment runs with those of "simulated 1 kHz": a search of its own lowers the total RMSE
-there by 3 %. docs/validation.md has the scores; the code of the search is in the history of this file.
+there by 3 %. The code of the search and its scores are in the history of this file and of docs/validation.md.
 """
 
 from __future__ import annotations

@@ -59,8 +59,8 @@ def format_paper(experiment: str, method: str) -> str:
 def render_page(content: Content) -> str:
     """Render the page; a section whose experiments were not run is left out."""
 
-    def table(figures: Sequence[str], *experiments: str) -> str:
-        """A table: a row a method, a column a figure of each experiment, and the paper's own."""
+    def table(figures: Sequence[str], *experiments: str, trials: bool = True) -> str:
+        """A table: a row a method, a column a figure of each experiment, and the paper's own; below it the trials."""
         own = [name for name in experiments if name in content]
         methods = dict.fromkeys(method for name in own for method in content[name]["rows"])
         pairs = [(name, figure) for name in own for figure in figures]
@@ -71,7 +71,7 @@ def render_page(content: Content) -> str:
         for method, paper in zip(methods, papers, strict=True):
             cells = [_format(content[name]["rows"].get(method, {}).get(figure)) for name, figure in pairs]
             rows.append([method, *cells, *([paper] if any(papers) else [])])
-        return "\n".join([_format_table(header, rows), "", *_describe_trials(content, own)])
+        return "\n".join([_format_table(header, rows), "", *(_describe_trials(content, own) if trials else ())])
 
     def in_short() -> str:
         rows = []
