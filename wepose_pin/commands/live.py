@@ -205,7 +205,7 @@ def _print_end(session: SessionSummary, robot: RobotOutput | None, record: Path 
     titles = ("sensor", "ticks without", "late", "twice", "unsound", "samples", "frozen", "cut off")
     print_table(title, titles, [(name, *map(str, counts.values())) for name, counts in session.counts.items()])
     for problem, count in session.problems.items():
-        say(f"Left out: {problem} ({count}).")
+        say(f"Left out: {problem}{f', {count} times' if count > 1 else ''}.")
     if robot is not None:
         posed, name = robot.states.total(), robot.robot.map.name
         shares = ", ".join(f"{100.0 * count / posed:.1f} % {state}" for state, count in robot.states.most_common())
