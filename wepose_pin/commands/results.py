@@ -164,9 +164,9 @@ def _print_errors(errors: Evaluation) -> None:
         say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
         fitted = registration.correlation == registration.correlation  # NaN where the offset was stated
         clock = f"speeds correlate by {registration.correlation:.3f}" if fitted else "stated"
-        say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
-        say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
-        say("  its points moved by {:+.3f} {:+.3f} {:+.3f} m".format(*registration.shift_m))
+        say(f"  its clock {registration.offset_s:+z.3f} s ({clock})")
+        say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+z.1f} deg about the vertical")
+        say("  its points moved by {:+z.3f} {:+z.3f} {:+z.3f} m".format(*registration.shift_m))
         if registration.frames_deg:
             frames = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
             say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {frames}")
@@ -174,7 +174,7 @@ def _print_errors(errors: Evaluation) -> None:
     for name, error in errors.attitude.items():
         axes = (f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw))
         rms = (f"{value:.2f}" for value in (error.inclination_rmse, error.heading_rmse, error.total_rmse))
-        rows.append((name, *axes, *rms, f"{error.drift_deg_min:+.2f}"))
+        rows.append((name, *axes, *rms, f"{error.drift_deg_min:+z.2f}"))
     print_table(
         "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
         ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
@@ -183,8 +183,8 @@ def _print_errors(errors: Evaluation) -> None:
     rows = []
     for joint, angles in errors.joints.items():
         for angle, e in angles.items():
-            limits, icc, extent = f"{e.lower:+.2f} to {e.upper:+.2f}", f"{e.icc:.3f}", f"{e.range:.0f}"
-            rows.append((joint, angle, f"{e.mean:+.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}", limits, icc, extent))
+            limits, icc, extent = f"{e.lower:+z.2f} to {e.upper:+z.2f}", f"{e.icc:z.3f}", f"{e.range:.0f}"
+            rows.append((joint, angle, f"{e.mean:+z.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}", limits, icc, extent))
     print_table(
         "Joint angle error [deg], near gimbal lock left out; limits of agreement (Bland-Altman, 95 %); ICC(A,1)",
         ("joint", "angle", "mean", "rms", "largest", "limits of agreement", "ICC", "range"),

@@ -60,11 +60,11 @@ def simulate(
         Sample the sensors at this rate, 20 to 2000 Hz.
     imperfection
         Simulate one imperfection at this size; may be given several times. mount=any: arbitrary sensor mounting, which
-        the session does not state. All others are numbers, 0 is off. Of the body, as a multiple of the size in the
-        literature: tissue_gain, tissue_random, girdle, elbow, wrists, start_pose, sway; palm_slip [m],
-        start_heading_deg, sensor_place. Of the sensors: gyro_scale, accel_scale (0.01 is 1 %), misalignment_deg,
+        the session does not state. All others are numbers; 0 is off, or inf for a range. Of the body, as a multiple of
+        the size in the literature: tissue_gain, tissue_random, girdle, elbow, wrists, start_pose, sway, sensor_place;
+        palm_slip [m], start_heading_deg. Of the sensors: gyro_scale, accel_scale (0.01 is 1 %), misalignment_deg,
         g_sensitivity_deg_s, clock_jitter [s], clock_offset [s], clock_drift_ppm, gyro_range_deg_s, accel_range_g, bits,
-        dropped (share of the samples), gyro_warm_up_deg_s, accel_average.
+        dropped (share of the samples), gyro_warm_up_deg_s, accel_average (share of the time between samples).
     """
     options = dict(locals())
     from dataclasses import fields, replace

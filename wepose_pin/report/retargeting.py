@@ -105,20 +105,20 @@ def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Ite
     rows = []
     for j in (j for arm in robot.arms for j in arm.joints.tolist()):
         name, position, limit = robot.names[j], trajectory.joint_position[:, j], limits[robot.names[j]]
-        factor, unit = (1e3, "mm") if limit.kind == "prismatic" else (180.0 / np.pi, "°")
+        factor, unit = (1e3, " mm") if limit.kind == "prismatic" else (180.0 / np.pi, "°")
         margin = factor * float(np.minimum(position - limit.lower, limit.upper - position).min())
         most = limit.velocity, robot.map.acceleration[name], robot.map.jerk[name]
         used = (
             np.abs(values[:, j]).max() for values in (trajectory.joint_velocity, trajectory.joint_acceleration, jerk)
         )
         shares = (f"{100.0 * value / end:.0f} % of {end:g}" for value, end in zip(used, most, strict=True))
-        rows.append([plain(name), number(margin, 1, f" {unit}", unknown="no limit"), *shares])
+        rows.append([plain(name), number(margin, 1, unit, unknown="no limit"), *shares])
     return [
         Table("", ["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
-        f"Limits are those of the robot's map, else of its URDF. {100 * robot.speed_scale:g} % of those of velocity, "
-        f"acceleration and jerk are used (`--speed-scale`), and {robot.limit_margin:g} rad are left to each position "
-        f"limit (`--limit-margin`). In {100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked, "
-        "to keep all limits and a way to stop.",
+        f"Limits, in rad or m and s, are those of the robot's map, else of its URDF. {100 * robot.speed_scale:g} % of "
+        f"those of velocity, acceleration and jerk are used (`--speed-scale`), and {robot.limit_margin:g} rad are left "
+        f"to each position limit (`--limit-margin`). In {100 * summary['steps']['stopping_share']:.2f} % of the steps "
+        "the robot braked, to keep all limits and a way to stop.",
     ]
 
 
