@@ -1,6 +1,7 @@
 """`wepose info`: what a file is, and a session that can be read as it is printed."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -221,9 +222,10 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
     text = info(capsys, tmp_path / "session")
     assert "a session, 'made'" in text
     assert "phase start [s]" in text
-    person.prior.save(tmp_path / "subject.toml")
+    replace(person.prior, quality="poor").save(tmp_path / "subject.toml")
     text = info(capsys, tmp_path / "subject.toml")
     assert "a subject, '" in text
+    assert "quality of the calibration: poor" in text
     assert "left_upper_arm" in text
     wp.track(recording, person.prior).save(tmp_path / "result")
     text = info(capsys, tmp_path / "result")

@@ -187,6 +187,7 @@ def _describe_toml(path: Path) -> Description:
         facts = ["lengths [mm]: " + ", ".join(f"{name} {1e3 * length:.0f}" for name, length in lengths.items())]
         mounts = ", ".join(values.get("mounts") or ())
         facts.append(f"mounts: {mounts}" if mounts else "no calibrated mounts")
+        facts += [f"quality of the calibration: {quality}"] if (quality := values.get("quality")) else []
         return Description(path, f"a subject, '{values.get('name', '')}'", facts)
     raise BadData(f"{path}: TOML, but neither a session ([data], [sensors.…]) nor a subject ([lengths])")
 
