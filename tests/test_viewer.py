@@ -140,3 +140,14 @@ def test_it_plays_by_itself_and_stands_still_at_an_address(browser: Browser, pag
     time.sleep(1.0)
     assert browser.run(now) == pytest.approx(20.0, abs=0.03)
     assert browser.errors == []
+
+
+@in_browser
+def test_angles_for_which_there_is_no_room_scroll(browser: Browser, page: Path) -> None:
+    open_page(browser, page, "#t=20")
+    size = {"width": 1200, "height": 320, "deviceScaleFactor": 1, "mobile": False}
+    browser.call("Emulation.setDeviceMetricsOverride", **size)
+    angles, stage = (f"document.getElementById('{name}')" for name in ("angles", "stage"))
+    assert browser.wait(f"{angles}.scrollHeight > {angles}.clientHeight")
+    assert browser.run(f"{angles}.getBoundingClientRect().bottom <= {stage}.getBoundingClientRect().bottom")
+    browser.call("Emulation.clearDeviceMetricsOverride")
