@@ -9,24 +9,17 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from functools import lru_cache
 from html import escape
 from pathlib import Path
 from string import Formatter
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
-
-class Severity(StrEnum):
-    """How much a diagnostic weighs."""
-
-    INFO = "info"  # worth knowing; the results are as good as they can be
-    WARNING = "warning"  # results may be wrong or uncertain by it
-    ERROR = "error"  # results must not be used
-
-
-INFO, WARNING, ERROR = Severity.INFO, Severity.WARNING, Severity.ERROR
+Severity = Literal["info", "warning", "error"]
+INFO: Severity = "info"  # worth knowing; the results are as good as they can be
+WARNING: Severity = "warning"  # results may be wrong or uncertain by it
+ERROR: Severity = "error"  # results must not be used
 MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are shown in full
 
 
@@ -44,7 +37,7 @@ class Diagnostic:
 
     def __str__(self) -> str:
         """The severity and the text, in one line."""
-        return f"{self.severity.value}: {join_text(render(self))}"
+        return f"{self.severity}: {join_text(render(self))}"
 
 
 def render(diagnostic: Diagnostic) -> dict[str, str]:
@@ -91,7 +84,7 @@ def lines(diagnostics: Iterable[Diagnostic], titled: bool = False) -> list[tuple
 
 def notebook_html(value: object, diagnostics: Iterable[Diagnostic]) -> str:
     """Return what a notebook shows of an object: its one line, and diagnostics in words."""
-    entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(diagnostics))
+    entries = "".join(f"<li>{severity}: {escape(line)}</li>" for severity, line in lines(diagnostics))
     return f"<p>{escape(repr(value))}</p>" + (f"<ul>{entries}</ul>" if entries else "")
 
 
@@ -127,7 +120,7 @@ def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
 def from_json(content: Mapping[str, Any]) -> Diagnostic:
     """Return the diagnostic of `as_json`; its text is not read."""
     place, value, limit, facts = (content[name] for name in ("place", "value", "limit", "facts"))
-    return Diagnostic(content["code"], Severity(content["severity"]), place, value, limit, facts)
+    return Diagnostic(content["code"], content["severity"], place, value, limit, facts)
 
 
 # Unit → factor from SI, name with the space before it, and least number of significant digits.

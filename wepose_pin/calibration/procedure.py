@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from ..arguments import Positive, check_arguments
+from ..arguments import Positive, check_arguments, check_names
 from ..body import BodyModel, BodyTable, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
 from ..body.girdle import PARAMETERS
@@ -38,7 +38,7 @@ from ..body.subject import Hinge, Subject, girdle_rows, mount_rows, population_s
 from ..body.table import check_segments
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
-from ..filters import BEST, SensorFilters, check_method, collect_orientations
+from ..filters import BEST, METHODS, SensorFilters, collect_orientations
 from ..filters.phases import find_reference_phases
 from ..recording import Recording
 from .equations import GAP_ROWS, HINGE_STD, Layout, build_prior
@@ -141,7 +141,7 @@ def calibrate(
     'poor'
     """
     check_arguments(calibrate, locals())
-    check_method(method)
+    check_names("method", [method], METHODS)
     is_stated = protocol is not None
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(choose_protocol(recording.phases, formulation) if protocol is None else protocol)

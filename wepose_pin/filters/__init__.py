@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..arguments import Positive, check_arguments, check_value
+from ..arguments import Positive, check_arguments, check_names, check_value
 from ..diagnostics import WARNING, Diagnostic, join_text, render
-from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
+from ..errors import BadData, BadPhase, WeposeWarning
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.faults import check_arrays, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
@@ -52,13 +52,6 @@ METHODS: dict[str, OrientationFilter] = {
 BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
 STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
-
-
-def check_method(method: str) -> str:
-    """Return the method, or raise `BadOption` where there is none of that name."""
-    if method not in METHODS:
-        raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
-    return method
 
 
 _Records = tuple[np.ndarray, ...]
@@ -281,7 +274,7 @@ def estimate_orientation(
     (2251, 4)
     """
     check_arguments(estimate_orientation, locals())
-    check_method(method)
+    check_names("method", [method], METHODS)
     kind = METHODS[method].params_type
     check_value("params", params, kind | None if kind else type(None))
     try:

@@ -6,8 +6,8 @@ Information Fusion 91). A tilt error of 1° would give 8 m in 10 s; a segment do
 estimate the gyroscope's bias, its scale and misalignment (3×3), which rotation about horizontal axes makes observable.
 The heading is not observed; it improves with these parameters.
 
-V is the sensor's own world: z up, heading that of the filter's start. The 22 errors (`ErrorStates`) are additive
-except the attitude error, a rotation on the left, in V: R = exp(θ) R_estimated. It does not change when the sensor
+V is the sensor's own world: z up, heading that of the filter's start. The 22 errors are additive except the
+attitude error, a rotation on the left, in V: R = exp(θ) R_estimated. It does not change when the sensor
 rotates. Measured rate = (I + M) true rate + bias. Errors of velocity and position are those of
 the invariant filter (Barrau and Bonnabel 2017, IEEE TAC 62(4)): θ × g e_z alone drives them, so that their bound gives
 no information on the heading.
@@ -18,7 +18,6 @@ velocity is zero and the gyroscope measures its bias.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,27 +26,20 @@ from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED
 from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector
 from . import base
-from .phases import SensorNoise
+from .phases import SensorNoise, average_variance
 
-
-class ErrorStates(NamedTuple):
-    """Index range of each error among the 22."""
-
-    attitude: slice = slice(0, 3)  # θ [rad], on the left, in V
-    velocity: slice = slice(3, 5)  # [m/s], horizontal, in V
-    position: slice = slice(5, 7)  # [m], horizontal, in V
-    gyro_bias: slice = slice(7, 10)  # [rad/s], in S
-    gyro_matrix: slice = slice(10, 19)  # M, rows first
-    accel_bias: slice = slice(19, 22)  # [m/s²], in S
-
-
-ERROR = ErrorStates()
+# Index range of each error among the states
+ATTITUDE = slice(0, 3)  # θ [rad], on the left, in V
+VELOCITY = slice(3, 5)  # [m/s], horizontal, in V
+POSITION = slice(5, 7)  # [m], horizontal, in V
+GYRO_BIAS = slice(7, 10)  # [rad/s], in S
+GYRO_MATRIX = slice(10, 19)  # M, rows first
+ACCEL_BIAS = slice(19, 22)  # [m/s²], in S
 STATES = 22
 COLUMNS = 24  # of matrices in the record: rows of whole processor vectors; beyond the 22 states they are zero
 PROPAGATED_STATES = 7  # θ, velocity and position change over a block, the other states stay
 SMOOTHED_STATES = (0, 1, 2, 7, 8, 9)  # states that the smoother corrects: θ, bias
 MAX_MEASUREMENTS = 5  # of a static block: velocity (2) and bias (3); of another: velocity (2) and position (2)
-VELOCITY, POSITION, GYRO_BIAS = ERROR.velocity.start, ERROR.position.start, ERROR.gyro_bias.start
 
 # Squared Mahalanobis distance beyond which an innovation of two or three axes is an outlier: χ² quantiles of 0.9973,
 # which is 3 σ of one axis.
@@ -104,7 +96,7 @@ def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def
     θ × g e_z while accel is measured; b, f are the errors of the gyroscope's and the accelerometer's bias.
     """
     columns = P.shape[1]
-    bias, matrix, force = P[ERROR.gyro_bias], P[ERROR.gyro_matrix], P[ERROR.accel_bias]
+    bias, matrix, force = P[GYRO_BIAS], P[GYRO_MATRIX], P[ACCEL_BIAS]
     for i in range(3):
         for j in range(columns):
             out[i, j] = P[i, j]
@@ -118,7 +110,7 @@ def fill_transition_rows(block, gravity, P, out):  # type: ignore[no-untyped-def
     g, t = 0.5 * block.accel_s * gravity, 0.5 * block.length
     for i in range(2):
         sign, other = (g, 1) if i == 0 else (-g, 0)
-        v, p = VELOCITY + i, POSITION + i
+        v, p = VELOCITY.start + i, POSITION.start + i
         x, y, z = block.R[i, 0], block.R[i, 1], block.R[i, 2]
         for j in range(columns):
             moved = x * force[0, j] + y * force[1, j] + z * force[2, j]
@@ -153,8 +145,8 @@ def _propagate(state, model):  # type: ignore[no-untyped-def]
         P[i, i] += model.noise_psd[i] * block.length
     for i in range(3):
         P[i, i] = base.add_lost(P[i, i] + attitude_var, block.lost_rotation_var)
-    P[VELOCITY, VELOCITY] += velocity_var
-    P[VELOCITY + 1, VELOCITY + 1] += velocity_var
+    P[VELOCITY.start, VELOCITY.start] += velocity_var
+    P[VELOCITY.start + 1, VELOCITY.start + 1] += velocity_var
 
 
 @inlined
@@ -209,7 +201,7 @@ def _correct_to_zero(state, at, variance):  # type: ignore[no-untyped-def]
 @inlined
 def _correct_bias(state, variance):  # type: ignore[no-untyped-def]
     """Correct by the mean of gyro over a static block; where it is an outlier, the bias has jumped by as much."""
-    P, at, y = state.P, GYRO_BIAS, state.innovation
+    P, at, y = state.P, GYRO_BIAS.start, state.innovation
     size, expected = 0.0, variance
     for i in range(3):
         state.measured[i] = state.gyro_sum[i] / state.samples
@@ -235,19 +227,19 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     static = state.static_samples == state.samples
     if static:
         P[2, 2] += model.static_heading_psd * block.length
-    _correct_to_zero(state, VELOCITY, model.static_velocity_var if static else model.velocity_var)
+    _correct_to_zero(state, VELOCITY.start, model.static_velocity_var if static else model.velocity_var)
     if static:
         _correct_bias(state, model.static_bias_var)
     else:
-        _correct_to_zero(state, POSITION, model.position_var)
+        _correct_to_zero(state, POSITION.start, model.position_var)
     vertical = state.about_vertical
     vertical[base.HEADING] += block.correction[2]
     vertical[base.RATE_VAR] = 0.0
     for i in range(3):
-        vertical[base.RATE] += R[2, i] * block.correction[GYRO_BIAS + i]
+        vertical[base.RATE] += R[2, i] * block.correction[GYRO_BIAS.start + i]
         for j in range(3):
-            vertical[base.RATE_VAR] += R[2, i] * R[2, j] * P[GYRO_BIAS + i, GYRO_BIAS + j]
-    for i in range(VELOCITY, STATES):
+            vertical[base.RATE_VAR] += R[2, i] * R[2, j] * P[GYRO_BIAS.start + i, GYRO_BIAS.start + j]
+    for i in range(VELOCITY.start, STATES):
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_VS, block.correction[0], block.correction[1], block.correction[2])
     state.samples = state.static_samples = 0
@@ -261,7 +253,7 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
 def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]. Return whether a block ended."""
     dt, x, R, block, began = model.dt, state.x, state.R_VS, state.block, 1.0 if state.samples else 0.0
-    bias = x[ERROR.gyro_bias]
+    bias = x[GYRO_BIAS]
     ux, uy, uz, is_measured, lost_var = base.bridge_rate(state, model, gx, gy, gz, bias[0], bias[1], bias[2])
     if is_measured:
         state.gyro_sum[0] += gx
@@ -269,7 +261,7 @@ def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-unty
         state.gyro_sum[2] += gz
         state.static_samples += static
     state.lost_rotation_var += lost_var
-    M = x[ERROR.gyro_matrix]
+    M = x[GYRO_MATRIX]
     wx = ux - (M[0] * ux + M[1] * uy + M[2] * uz)
     wy = uy - (M[3] * ux + M[4] * uy + M[5] * uz)
     wz = uz - (M[6] * ux + M[7] * uy + M[8] * uz)
@@ -283,7 +275,7 @@ def _step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-unty
             block.R_rate[0, i, c] = began * block.R_rate[0, i, c] + R_dt * ux
             block.R_rate[1, i, c] = began * block.R_rate[1, i, c] + R_dt * uy
             block.R_rate[2, i, c] = began * block.R_rate[2, i, c] + R_dt * uz
-    velocity, position, force_bias = x[ERROR.velocity], x[ERROR.position], x[ERROR.accel_bias]
+    velocity, position, force_bias = x[VELOCITY], x[POSITION], x[ACCEL_BIAS]
     position[0] += dt * velocity[0]
     position[1] += dt * velocity[1]
     if ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
@@ -326,23 +318,23 @@ def run(states, models, blocks, gyro_S, accel_S, static, out_quat, out_bias, out
         for i in range(4):
             out_quat[k, i] = state.quat_VS[i]
         for i in range(3):
-            out_bias[k, i], out_vertical[k, i] = state.x[GYRO_BIAS + i], state.about_vertical[i]
+            out_bias[k, i], out_vertical[k, i] = state.x[GYRO_BIAS.start + i], state.about_vertical[i]
 
 
 def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: AmekfParams) -> tuple[np.ndarray, ...]:
     """Return the state and the constants of an aMEKF."""
     x, std, P = np.zeros(STATES), np.zeros(STATES), np.zeros((STATES, COLUMNS))
-    x[ERROR.gyro_bias] = noise.gyro_bias
-    std[ERROR.attitude] = p.tilt_std, p.tilt_std, base.START_HEADING_STD
-    std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
-    std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
+    x[GYRO_BIAS] = noise.gyro_bias
+    std[ATTITUDE] = p.tilt_std, p.tilt_std, base.START_HEADING_STD
+    std[VELOCITY], std[POSITION] = p.speed_std, p.position_std
+    std[GYRO_MATRIX], std[ACCEL_BIAS] = p.gyro_matrix_std, p.accel_bias_std
     np.fill_diagonal(P, std**2)
-    P[ERROR.gyro_bias, ERROR.gyro_bias] = noise.gyro_bias_cov
+    P[GYRO_BIAS, GYRO_BIAS] = noise.gyro_bias_cov
     state = base.make_record(
         quat_VS=quat_VS,  # (4,) xyzw
-        x=x,  # (22,) as `ErrorStates`; the attitude's error is always zero
+        x=x,  # (22,) the attitude's error is always zero
         P=P,  # (22, 24)
-        about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
+        about_vertical=np.array([0.0, 0.0, average_variance(noise.gyro_bias_cov)]),  # as `Orientation`
         last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
         lost_s=0.0,  # [s] the same
         moved_s=0.0,  # [s] in motion since the start
@@ -367,11 +359,11 @@ def make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Ame
     )
     block_samples = max(1, round(p.block_s * rate_hz))
     length = block_samples / rate_hz
-    gyro_var, accel_var = float(np.trace(noise.gyro_cov)) / 3.0, float(np.trace(noise.accel_cov)) / 3.0
+    gyro_var, accel_var = average_variance(noise.gyro_cov), average_variance(noise.accel_cov)
     noise_psd = np.zeros(STATES)
-    noise_psd[ERROR.attitude] = gyro_var / rate_hz
-    noise_psd[ERROR.velocity] = accel_var * noise.gravity**2 / rate_hz
-    noise_psd[ERROR.gyro_bias], noise_psd[ERROR.accel_bias] = p.gyro_bias_walk**2, p.accel_bias_walk**2
+    noise_psd[ATTITUDE] = gyro_var / rate_hz
+    noise_psd[VELOCITY] = accel_var * noise.gravity**2 / rate_hz
+    noise_psd[GYRO_BIAS], noise_psd[ACCEL_BIAS] = p.gyro_bias_walk**2, p.accel_bias_walk**2
     # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
     white, sway = gyro_var / block_samples, noise.sway_density(rate_hz)
     model = base.make_record(

@@ -51,8 +51,8 @@ class SensorNoise:
 
     def sway_density(self, rate_hz: float) -> float:
         """Compute the density [rad²/s] of sway on each axis; the mean rate over T s has 1/T of it as variance."""
-        white = float(np.trace(self.gyro_cov)) / 3.0 / (BLOCK_S * rate_hz)
-        total, bias = float(np.trace(self.gyro_half_second_cov)) / 3.0, float(np.trace(self.gyro_bias_cov)) / 3.0
+        white = average_variance(self.gyro_cov) / (BLOCK_S * rate_hz)
+        total, bias = average_variance(self.gyro_half_second_cov), average_variance(self.gyro_bias_cov)
         if total <= white:
             return 0.0
         # Where the bias is hardly more certain than the sway, a steady rotation is as likely as a bias, while it lasts.
@@ -98,7 +98,7 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     if worn:  # what sways comes back: its mean is smaller than that of independent blocks
         half_second_cov = _estimate_sway_cov(gyro_S, size, half_second_cov)
         allowed = min(1.0, 2.0 / (SWAY_RATE * n / rate_hz) ** 2)
-        bias_cov = bias_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
+        bias_cov = bias_cov + average_variance(half_second_cov) * allowed * np.eye(3)
     return SensorNoise(
         gyro_bias=average_blocks(gyro_S, n)[0],
         gyro_bias_cov=bias_cov,
@@ -121,7 +121,7 @@ def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray) -> n
     if degrees < 3:
         return SWAY_RATE_STD**2 * np.eye(3)
     white = _compute_step_var(gyro_S) / 2.0 / size
-    excess = float(np.trace(measured)) / 3.0 - white
+    excess = average_variance(measured) - white
     prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
     return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
 
@@ -143,6 +143,11 @@ def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
     """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of the time of `mean`."""
     count = len(values) // size
     return np.asarray(np.full(size, 1.0 / size) @ values[: count * size].reshape(count, size, 3))
+
+
+def average_variance(cov: np.ndarray) -> float:
+    """Return the mean variance of the axes of a covariance (3, 3)."""
+    return float(cov[0, 0] + cov[1, 1] + cov[2, 2]) / 3.0
 
 
 def estimate_start_tilt(

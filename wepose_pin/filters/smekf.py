@@ -26,7 +26,7 @@ from ..compilation import compiled, fma, inlined, kernel
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import fill_matrix, rotate_by_vector, rotate_by_world_vector, up_in_sensor
 from . import base
-from .phases import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
+from .phases import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise, average_variance
 
 
 @dataclass(frozen=True)
@@ -182,11 +182,11 @@ def _make_records(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, p: Sm
         moved_s=0.0,  # [s] in motion since the start
         last_rate=np.zeros(3),  # [rad/s] as `bridge_rate`
         lost_s=0.0,  # [s] the same
-        about_vertical=np.array([0.0, 0.0, np.trace(noise.gyro_bias_cov) / 3.0]),  # as `Orientation`
+        about_vertical=np.array([0.0, 0.0, average_variance(noise.gyro_bias_cov)]),  # as `Orientation`
         R_VS=np.zeros((3, 3)),
     )
     covs = noise.gyro_cov, noise.accel_cov, noise.bias_step_cov
-    gyro_var, accel_var, step_var = (float(np.trace(cov)) / 3.0 for cov in covs)
+    gyro_var, accel_var, step_var = map(average_variance, covs)
     model = base.make_record(
         dt=1.0 / rate_hz,  # [s]
         inverse_gravity=1.0 / noise.gravity,  # [s²/m]

@@ -22,7 +22,7 @@ from scipy.special import gammainc, gammaincinv
 from ..arguments import NonNegative, PositiveOrInfinite, Range
 from ..compilation import inlined, kernel
 from .base import FilterParams, make_record
-from .phases import BLOCK_S, SensorNoise
+from .phases import BLOCK_S, SensorNoise, average_variance
 
 WHITE_RATE_HZ = 200.0  # of (1) and (2), where 0.5 s are 100 samples, the longest window of the authors' software
 NEWEST_S = 0.05  # [s] of condition (6), about as long as the fastest smooth motion takes to begin
@@ -80,7 +80,7 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
     n, newest = test.samples(rate_hz), max(1, round(NEWEST_S * rate_hz))
     dt, window_s = 1.0 / rate_hz, n / rate_hz
     half_second_cov = noise.gyro_half_second_cov
-    white, sway = np.trace(noise.gyro_cov) / 3.0 / n, np.trace(half_second_cov) / 3.0 * BLOCK_S / window_s
+    white, sway = average_variance(noise.gyro_cov) / n, average_variance(half_second_cov) * BLOCK_S / window_s
     # (6): the inverse covariance of the change over the square of its bound, χ² of three axes as probable as of one
     squared_bound = 2.0 * gammaincinv(1.5, gammainc(0.5, test.rate_stds**2 / 2.0))
     rate_change = np.zeros((3, 3))
@@ -92,7 +92,7 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
     white_share = white_share if np.isfinite(test.rate_stds) else 1.0
     limits = []
     for factor, cov, white_var in (
-        (test.alpha, noise.gyro_cov, np.trace(noise.bias_step_cov) / 6.0),
+        (test.alpha, noise.gyro_cov, average_variance(noise.bias_step_cov) / 2.0),
         (test.beta, noise.accel_cov, noise.accel_step_var / 2.0),
     ):
         if white_share < 1.0:  # what is taken away, the quietest axis has too
@@ -125,7 +125,7 @@ def make_static_records(noise: SensorNoise, rate_hz: float, test: StaticTest) ->
         moves=np.bool_(False),  # a sample of the block is too far from the anchor for any static window
         moves_until=np.int64(n),  # of the block before, the last sample that is; `tail` begins after it
         bias=noise.gyro_bias,  # [rad/s] the known bias of condition (5)
-        bias_var=np.trace(noise.gyro_bias_cov) / 3.0,  # [rad²/s²]
+        bias_var=average_variance(noise.gyro_bias_cov),  # [rad²/s²]
         average_rate=0.0,  # [rad/s] about the vertical, beyond the known bias
     )
     return state, model, block, tail

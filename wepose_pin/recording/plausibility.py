@@ -188,4 +188,5 @@ def _average_coherence(turns: np.ndarray, accel_S: np.ndarray) -> float:
 def _average_force(turns: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
     """Return the length (k,) of the mean force over each of k windows (k, n, 3), in a frame that does not turn."""
     forces = unroll(turns.reshape(-1, 3), accel_S.reshape(-1, 3)).reshape(accel_S.shape)
-    return np.asarray(np.linalg.norm(forces.mean(axis=1), axis=1))
+    size = accel_S.shape[1]
+    return np.asarray(np.linalg.norm(np.full(size, 1.0 / size) @ forces, axis=1))

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
+from ..arguments import check_names
 from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.configuration import KinematicsSolver
@@ -31,7 +32,7 @@ from ..body.table import check_segments
 from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..errors import BadOption, BadPhase, BadSession
-from ..filters import BEST, OFFLINE, Orientation, SensorFilters, average_start, check_method, collect_orientations
+from ..filters import BEST, METHODS, OFFLINE, Orientation, SensorFilters, average_start, collect_orientations
 from ..filters.base import HEADING, HOLD_S, LOST_RATE_STD, MOST_LOST_STD
 from ..filters.phases import BEGINNING_S, find_reference_phases
 from ..filters.static import StaticTest
@@ -99,7 +100,7 @@ class Tracker:
         open_loop: bool = False,
         causal: bool = False,
     ) -> None:
-        check_method(method)
+        check_names("method", [method], METHODS)
         if causal and method in OFFLINE:
             raise BadOption(f"method '{method}' needs the whole recording; 'amekf' looks at nothing ahead")
         self.options = {"method": method, "static_test": static_test, "open_loop": open_loop}
