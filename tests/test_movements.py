@@ -144,6 +144,18 @@ def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Pat
     assert not (tmp_path / "a" / "repetitions.svg").exists()
 
 
+def test_a_single_repetition_has_its_ranges_and_no_mean_curves(results: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "a"
+    assert run("angles", results[0], "-o", out, "--repetitions", "bend", "--interval", 3, 6) == 0
+    summary = pl.read_csv(out / "summary.csv").filter(
+        (pl.col("joint") == "right_elbow") & (pl.col("angle") == "flexion")
+    )
+    assert summary["repetitions"].to_list() == [1]
+    assert summary["cmc"].to_list() == [None]
+    assert not [path for path in out.iterdir() if path.name.startswith("curves")]
+    assert "fewer than two repetitions" in (out / "angles.html").read_text(encoding="utf-8")
+
+
 def test_where_nothing_repeats_there_are_phases_all_the_same(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

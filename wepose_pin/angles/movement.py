@@ -36,7 +36,7 @@ class Movement:
     angles: Angles
     phases: Mapping[str, Intervals]  # of the recording, as far as they lie in the time of the pose
     repetitions: Repetitions  # found, or marked by a phase
-    curves: Mapping[str, tuple[MeanCurve, ...]]  # joint → its three mean curves; empty without repetitions
+    curves: Mapping[str, tuple[MeanCurve, ...]]  # joint → its three mean curves; empty of fewer than two repetitions
     cutoff_hz: float | None  # of the low-pass; None: there is none
 
     @property
@@ -77,7 +77,7 @@ def analyze_movement(
     else:
         choices = one_of((*phases, *places), repetitions, 30)
         raise WrongOption("repetitions", repetitions, f"no such phase of the recording, and no such angle; {choices}")
-    curves = compute_mean_curves(angles, occurrences.spans) if len(occurrences.spans) else {}
+    curves = compute_mean_curves(angles, occurrences.spans) if len(occurrences.spans) > 1 else {}
     return Movement(name, pose, angles, inside, occurrences, curves, cutoff_hz)
 
 
@@ -304,8 +304,10 @@ def _summarize_repetitions(movements: Sequence[Movement], repetitions: pl.DataFr
         for joint, curves in movement.curves.items()
         for angle, curve in zip(movement.angles[joint].names, curves, strict=True)
     ]
-    table = repetitions.group_by(*names, maintain_order=True).agg(columns).fill_null(float("nan"))
-    return table.join(pl.DataFrame(cmc), on=names[:3], maintain_order="left")
+    table = repetitions.group_by(*names, maintain_order=True).agg(columns)
+    schema = {**dict.fromkeys(names[:3], pl.String), "cmc": pl.Float64}
+    table = table.join(pl.DataFrame(cmc, schema), on=names[:3], how="left", maintain_order="left")
+    return table.fill_null(float("nan"))
 
 
 def _tabulate_curves(movements: Sequence[Movement]) -> pl.DataFrame:

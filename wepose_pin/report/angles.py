@@ -83,7 +83,7 @@ def _describe_reliance(summary: pl.DataFrame) -> str:
         if np.isfinite(row["range_sd_deg"]):
             between[angle] = row["range_sd_deg"]
     if not between:
-        return "No repetitions were found, so this page has no mean curves."
+        return "There are fewer than two repetitions, so this page has no mean curves."
     worst = max(between, key=between.__getitem__)
     varies = f"Between repetitions the range of {worst} varies most, by ± {between[worst]:.1f}°."
     if not stated:
