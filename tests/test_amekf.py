@@ -155,6 +155,18 @@ def test_an_impact_does_not_tip_the_attitude() -> None:
     assert tilt_deg(errors(of, run(of._replace(accel=accel)).quat_VS))[2500:].max() < 1.0
 
 
+def test_a_vehicle_that_accelerates_turns_little() -> None:
+    """2 m/s² for 10 s, 20 m/s for 4 s, and back: no motion that the filter expects of a person."""
+    second = np.arange(6001) / RATE % 28.0
+    pushed = 2.0 * (second < 10.0) - 2.0 * ((second >= 14.0) & (second < 24.0))
+    turned = []
+    for of in map(drawn, range(4)):
+        force = np.outer(pushed[: len(of.gyro)] * of.moving, [1.0, 0.0, 0.0])
+        error = errors(of, run(of._replace(accel=of.accel + of.true.inv().apply(force))).quat_VS)[of.moving]
+        turned.append((rms(tilt_deg(error)), rms(heading_deg(error))))
+    assert np.mean(turned, axis=0).max() < 3.0
+
+
 def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
     """0.1 deg/s of sway, as a standing person has: at its end the rest knows the bias to a third of that, not less."""
     rng = np.random.default_rng(8)

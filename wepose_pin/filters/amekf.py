@@ -186,16 +186,20 @@ def _correct(state, at, axes, variance):  # type: ignore[no-untyped-def]
 
 @inlined
 def _correct_to_zero(state, at, variance):  # type: ignore[no-untyped-def]
-    """Correct by a measurement of two states from `at` on, zero, with more variance where it would be an outlier.
+    """Correct by a measurement of two states from `at` on, zero; an outlier gets the variance that it shows itself.
 
-    Both axes share it: the directions of the sensor's axes do not matter.
+    So it counts as little as an ordinary one: a vehicle, which no bound of a person's motion holds for, gives many in a
+    row. Both axes share the variance: the directions of the sensor's axes do not matter.
     """
     P, x, correction = state.P, state.x, state.block.correction
     y0, y1 = x[at] + correction[at], x[at + 1] + correction[at + 1]
     expected = 0.5 * (P[at, at] + P[at + 1, at + 1])
     for i in range(3):
         state.measured[i] = 0.0
-    _correct(state, at, 2, max(variance, (y0 * y0 + y1 * y1) / OUTLIER_CHI2_2 - expected))
+    size = y0 * y0 + y1 * y1
+    if size > OUTLIER_CHI2_2 * (expected + variance):
+        variance = size - expected
+    _correct(state, at, 2, variance)
 
 
 @inlined
