@@ -292,7 +292,10 @@ def test_meshes_stay_in_the_urdf_and_are_not_read(tmp_path: Path, caplog: pytest
     )
     text = small().replace('<link name="left_upper_arm"/>', f'<link name="left_upper_arm">{mesh}</link>')
     body = load_model(written(tmp_path, text)).with_lengths({"left_upper_arm": 0.6})
-    assert body.visuals == []
+    rods = [visual for visual in body.visuals if visual.link == "left_upper_arm"]
+    assert [(rod.kind, rod.size) for rod in rods] == [("cylinder", (0.02, pytest.approx(0.6)))]  # to the elbow
+    np.testing.assert_allclose(rods[0].p_LV, (0.0, 0.0, -0.3), atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(rods[0].quat_LV).apply((0.0, 0.0, 1.0)), (0.0, 0.0, -1.0), atol=1e-12)
     assert '<mesh filename="package://nowhere/arm.stl" scale="0.001 0.001 0.002"/>' in body.urdf()
     assert caplog.records == []
 

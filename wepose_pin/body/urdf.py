@@ -99,6 +99,8 @@ def find_example_data() -> Path | None:
 MAX_TRIANGLES = 30_000  # of a whole robot
 FINEST_CELL, CELL_GROWTH = 0.003, 1.4  # [m] size of the cells in which vertices are merged; factor until they suffice
 
+ROD_RADIUS = 0.02  # [m] of what is drawn of a body without shapes; shorter rods are not drawn
+
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) [m], triangles (m, 3)
 
 
@@ -114,7 +116,7 @@ class Visual(NamedTuple):
 
 
 def list_visuals(robot: Any) -> list[Visual]:
-    """List the visuals of all links that are boxes, cylinders or spheres."""
+    """List the visuals of all links that are boxes, cylinders or spheres; if there are none, rods between joints."""
     colours, visuals = {m.name: m.color.rgba for m in robot.materials if m.color is not None}, []
     for name, visual in ((link.name, visual) for link in robot.links for visual in link.visuals):
         box, cylinder, sphere = visual.geometry.box, visual.geometry.cylinder, visual.geometry.sphere
@@ -132,7 +134,18 @@ def list_visuals(robot: Any) -> list[Visual]:
         r, g, b, a = (float(v) for v in rgba)
         quat, p_LV = Rotation.from_matrix(visual.origin[:3, :3]).as_quat(), visual.origin[:3, 3].copy()
         visuals.append(Visual(name, kind, tuple(float(v) for v in size), quat, p_LV, (r, g, b, a)))
-    return visuals
+    return visuals or _list_rods(robot)
+
+
+def _list_rods(robot: Any) -> list[Visual]:
+    """List a rod from the origin of each link to each joint below it."""
+    rods = []
+    for joint in robot.joints:
+        way = joint.origin[:3, 3]
+        if ROD_RADIUS < (length := float(np.linalg.norm(way))) < np.inf:
+            quat = Rotation.align_vectors(way[None] / length, [[0.0, 0.0, 1.0]])[0].as_quat()
+            rods.append(Visual(joint.parent, "cylinder", (ROD_RADIUS, length), quat, 0.5 * way, (0.7, 0.7, 0.7, 1.0)))
+    return rods
 
 
 def reduce_triangles(meshes: list[Mesh], cell: float = FINEST_CELL) -> list[Mesh]:
