@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import stdtr  # of Student; scipy.stats takes half a second to load
 
 from .. import rotations
+from ..compilation import compiled
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadPhase, WeposeError
 from ..recording import ImuSensor, OrientationSensor, Recording, compute_rate, find_runs, format_span, format_time
@@ -86,63 +87,71 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     if not GRAVITY_RANGE[0] < gravity < GRAVITY_RANGE[1]:
         needed = "specific force in m/s² is needed, 9.8 upwards when static"
         raise BadPhase(f"accel_S is {gravity:.3g} in the static phase, which is no gravity; {needed}")
-    size, accel = max(1, round(BLOCK_S * rate_hz)), accel_S / gravity
-    blocks, gyro_cov = n // size, _compute_cov(gyro_S)
-    # Means of blocks average white noise out and keep sway; less than four show none.
-    half_second_cov = _compute_cov(average_blocks(gyro_S, size)) if blocks >= 4 else np.zeros((3, 3))
+    size = max(1, round(BLOCK_S * rate_hz))
+    gyro_bias, gyro_cov, step_cov, half_second_cov = _compute_moments(gyro_S, size)
+    _, accel_cov, accel_step_cov, _ = _compute_moments(accel_S / gravity, size)
+    blocks = n // size
+    if blocks < 4:  # means of blocks average white noise out and keep sway; so few show none
+        half_second_cov = np.zeros((3, 3))
     bias_cov = gyro_cov / n if blocks < 4 or worn else half_second_cov / blocks
-    covs = np.array([bias_cov, gyro_cov, _compute_cov(accel), _compute_cov(gyro_S[1:] - gyro_S[:-1])])
     floors = np.square([BIAS_FLOOR, GYRO_FLOOR, ACCEL_FLOOR, GYRO_FLOOR])[:, None, None] * np.eye(3)
-    covs += (np.linalg.eigvalsh(covs - floors)[:, :1, None] <= 0.0) * floors  # where any direction is below its floor
-    bias_cov, gyro_cov, accel_cov, step_cov = covs
+    bias_cov, gyro_cov, accel_cov, step_cov = floors + [bias_cov, gyro_cov, accel_cov, step_cov]
     if worn:  # what sways comes back: its mean is smaller than that of independent blocks
-        half_second_cov = _estimate_sway_cov(gyro_S, size, half_second_cov)
+        half_second_cov = _estimate_sway_cov(half_second_cov, average_variance(step_cov) / 2.0 / size, blocks)
         allowed = min(1.0, 2.0 / (SWAY_RATE * n / rate_hz) ** 2)
         bias_cov = bias_cov + average_variance(half_second_cov) * allowed * np.eye(3)
     return SensorNoise(
-        gyro_bias=average_blocks(gyro_S, n)[0],
+        gyro_bias=gyro_bias,
         gyro_bias_cov=bias_cov,
         gyro_cov=gyro_cov,
         accel_cov=accel_cov,
         bias_step_cov=step_cov,
         gravity=gravity,
-        accel_step_var=_compute_step_var(accel),
+        accel_step_var=average_variance(accel_step_cov),
         gyro_half_second_cov=half_second_cov,
     )
 
 
-def _estimate_sway_cov(gyro_S: np.ndarray, size: int, measured: np.ndarray) -> np.ndarray:
-    """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's means over blocks of `size` samples by sway.
+def _estimate_sway_cov(measured: np.ndarray, white: float, blocks: int) -> np.ndarray:
+    """Estimate the covariance (3, 3) [rad²/s²] of a worn sensor's means over so many blocks by sway.
 
-    It is the `measured` one with `SWAY_RATE_STD` as a prior, or without it where the means vary like white noise. A
+    It is the `measured` one with `SWAY_RATE_STD` as a prior, or without it where the means vary like `white` noise. A
     phase of less than two seconds gives no estimate: half a sway looks like a steady rotation.
     """
-    degrees = len(gyro_S) // size - 1
-    if degrees < 3:
+    if blocks < 4:
         return SWAY_RATE_STD**2 * np.eye(3)
-    white = _compute_step_var(gyro_S) / 2.0 / size
-    excess = average_variance(measured) - white
-    prior = PRIOR_BLOCKS * min(1.0, max(0.0, excess) / LEAST_SWAY_STD**2)
-    return (prior * SWAY_RATE_STD**2 * np.eye(3) + degrees * measured) / (prior + degrees)
+    prior = PRIOR_BLOCKS * min(1.0, max(0.0, average_variance(measured) - white) / LEAST_SWAY_STD**2)
+    return (prior * SWAY_RATE_STD**2 * np.eye(3) + (blocks - 1) * measured) / (prior + blocks - 1)
 
 
-def _compute_cov(values: np.ndarray) -> np.ndarray:
-    """Compute the covariance (3, 3) of samples (n, 3) as `np.cov`, in a quarter of its time."""
-    off = values - average_blocks(values, len(values))
-    return np.asarray(off.T @ off * (1.0 / (len(values) - 1)))
+@compiled
+def _compute_moments(values, size):  # type: ignore[no-untyped-def]
+    """Compute the mean (3,) of samples (n, 3), and covariances of them, their steps and the means of their blocks."""
+    steps, blocks = values[1:] - values[:-1], average_blocks(values, size)
+    return average_blocks(values, len(values))[0], _compute_cov(values), _compute_cov(steps), _compute_cov(blocks)
 
 
-def _compute_step_var(values: np.ndarray) -> float:
-    """Compute the variance of the first differences of samples (n, 3), the mean over the axes."""
-    steps = values[1:] - values[:-1]
-    off = steps - average_blocks(steps, len(steps))
-    return float(np.vdot(off, off)) / off.size
+@compiled
+def _compute_cov(values):  # type: ignore[no-untyped-def]
+    mean, cov = np.zeros(3), np.zeros((3, 3))
+    for k in range(len(values)):
+        for i in range(3):
+            mean[i] += values[k, i] / len(values)
+    for k in range(len(values)):
+        for i in range(3):
+            for j in range(3):
+                cov[i, j] += (values[k, i] - mean[i]) * (values[k, j] - mean[j])
+    return cov / (len(values) - 1)
 
 
-def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
+@compiled
+def average_blocks(values, size):  # type: ignore[no-untyped-def]
     """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of the time of `mean`."""
-    count = len(values) // size
-    return np.asarray(np.full(size, 1.0 / size) @ values[: count * size].reshape(count, size, 3))
+    means = np.zeros((len(values) // size, 3))
+    for k in range(len(means) * size):
+        for i in range(3):
+            means[k // size, i] += values[k, i]
+    return means / size
 
 
 def average_variance(cov: np.ndarray) -> float:
@@ -166,14 +175,12 @@ def estimate_start_tilt(
     norm = float(np.linalg.norm(mean))
     if not norm > 0.0:
         raise BadData("accel is zero in the start phase; the filter starts from the direction of gravity")
-    across = force - (force @ mean)[:, None] * mean / norm**2
     size = max(1, round(BLOCK_S * rate_hz))
-    blocks = len(across) // size
+    blocks, up = len(force) // size, mean / norm
     # In less than four blocks sway does not average out.
-    scatter, count = (
-        (average_blocks(across, size).var(axis=0, ddof=1), blocks) if blocks >= 4 else (across.var(axis=0), 1)
-    )
-    variance = float(scatter.sum()) / 2.0 / count
+    parts, count = (average_blocks(force, size), blocks) if blocks >= 4 else (force, 1)
+    across = parts - np.outer(parts @ up, up)
+    variance = float(across.var(axis=0, ddof=min(1, count - 1)).sum()) / 2.0 / count
     return rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm))
 
 

@@ -103,9 +103,8 @@ def _predict(A, C, B, R, wx, wy, wz, model):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _fuse(A, C, B, a, b, p, c, innovation, variance):  # type: ignore[no-untyped-def]
-    """Correct by a measurement of one state, whose covariances with a and b are p and c: P ← P − [p; c] [p; c]ᵀ/s."""
-    share = 1.0 / variance
+def _fuse(A, C, B, a, b, p, c, innovation, share):  # type: ignore[no-untyped-def]
+    """Correct by a measurement of one state, of covariances p, c with a, b: P ← P − [p; c] [p; c]ᵀ/s; `share`: 1/s."""
     gain, u, w = share * innovation, _scale(-share, p), _scale(-share, c)
     A, C, B = _symmetric(_add_outer(A, u, p)), _add_outer(C, u, c), _symmetric(_add_outer(B, w, c))
     return A, C, B, _add_scaled(a, gain, p), _add_scaled(b, gain, c)
@@ -121,12 +120,16 @@ def _correct(A, C, B, state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-
     """
     R, bias, g, s, v = state.R_VS, state.gyro_bias, model.inverse_gravity, model.static_gyro_var, model.static_accel_var
     a, b = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    A, C, B, a, b = _fuse(A, C, B, a, b, (C[0], C[3], C[6]), B[0:3], gx - bias[0], B[0] + s)
-    A, C, B, a, b = _fuse(A, C, B, a, b, (C[1], C[4], C[7]), B[3:6], gy - bias[1] - b[1], B[4] + s)
-    A, C, B, a, b = _fuse(A, C, B, a, b, (C[2], C[5], C[8]), B[6:9], gz - bias[2] - b[2], B[8] + s)
+    # The variance of each innovation given those before is a ratio of minors of B + s I: no division waits for another.
+    first, second, third, xy, xz, yz = B[0] + s, B[4] + s, B[8] + s, B[1], B[2], B[5]
+    minor = first * second - xy * xy
+    determinant = minor * third - first * yz * yz + xz * (2.0 * xy * yz - second * xz)
+    A, C, B, a, b = _fuse(A, C, B, a, b, (C[0], C[3], C[6]), B[0:3], gx - bias[0], 1.0 / first)
+    A, C, B, a, b = _fuse(A, C, B, a, b, (C[1], C[4], C[7]), B[3:6], gy - bias[1] - b[1], first / minor)
+    A, C, B, a, b = _fuse(A, C, B, a, b, (C[2], C[5], C[8]), B[6:9], gz - bias[2] - b[2], minor / determinant)
     x, y = g * (R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az), g * (R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az)
-    A, C, B, a, b = _fuse(A, C, B, a, b, A[3:6], C[3:6], -x - a[1], A[4] + v)
-    A, C, B, a, b = _fuse(A, C, B, a, b, A[0:3], C[0:3], y - a[0], A[0] + v)
+    A, C, B, a, b = _fuse(A, C, B, a, b, A[3:6], C[3:6], -x - a[1], 1.0 / (A[4] + v))
+    A, C, B, a, b = _fuse(A, C, B, a, b, A[0:3], C[0:3], y - a[0], 1.0 / (A[0] + v))
     state.about_vertical[base.HEADING] += a[2]
     for i in range(3):
         state.about_vertical[base.RATE] += R[2, i] * b[i]
