@@ -159,8 +159,7 @@ def _correct(state, at, axes, variance):  # type: ignore[no-untyped-def]
     for m in range(3):
         gain, measured_state, row = gains[m], at + m, block.measurements
         if m == axes:
-            for j in range(COLUMNS):
-                gain[j] = 0.0
+            gain[:] = 0.0
             break
         for j in range(COLUMNS):
             gain[j] = P[measured_state, j]
@@ -194,8 +193,7 @@ def _correct_to_zero(state, at, variance):  # type: ignore[no-untyped-def]
     P, x, correction = state.P, state.x, state.block.correction
     y0, y1 = x[at] + correction[at], x[at + 1] + correction[at + 1]
     expected = 0.5 * (P[at, at] + P[at + 1, at + 1])
-    for i in range(3):
-        state.measured[i] = 0.0
+    state.measured[:] = 0.0
     size = y0 * y0 + y1 * y1
     if size > OUTLIER_CHI2_2 * (expected + variance):
         variance = size - expected
@@ -225,8 +223,7 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     x, P, block, R = state.x, state.P, state.block, state.R_VS
     block.length, block.lost_rotation_var, block.measurements = state.samples * model.dt, state.lost_rotation_var, 0
     block.accel_s = block.length - state.lost_accel_s
-    for j in range(STATES):
-        block.correction[j] = 0.0
+    block.correction[:] = 0.0
     _propagate(state, model)
     static = state.static_samples == state.samples
     if static:
@@ -249,8 +246,7 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     state.samples = state.static_samples = 0
     state.rate_squared = state.acceleration_sum = state.impact_excess = 0.0
     state.lost_rotation_var = state.lost_accel_s = 0.0
-    for i in range(3):
-        state.gyro_sum[i] = 0.0
+    state.gyro_sum[:] = 0.0
 
 
 @inlined

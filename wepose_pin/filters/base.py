@@ -86,11 +86,8 @@ def join_orientations(parts: Sequence[Orientation]) -> Orientation:
 
 def make_orientation(n: int, noise: SensorNoise, *, covariance: bool) -> Orientation:
     """Return arrays for n samples, to be filled."""
-    memory = np.empty((19 if covariance else 7) * n)  # one piece for all takes half the time of four
-    quat, bias, cov, vertical = memory[: 4 * n].reshape(n, 4), memory[4 * n : 7 * n].reshape(n, 3), None, None
-    if covariance:
-        cov, vertical = memory[7 * n : 16 * n].reshape(n, 3, 3), memory[16 * n :].reshape(n, 3)
-    return Orientation(quat, bias, np.empty(n, np.bool_), cov, noise, (), vertical)
+    cov, vertical = (np.empty((n, 3, 3)), np.empty((n, 3))) if covariance else (None, None)
+    return Orientation(np.empty((n, 4)), np.empty((n, 3)), np.empty(n, np.bool_), cov, noise, (), vertical)
 
 
 # One object for all records of a kind: a call of a compiled step takes 1 µs more to see that two are the same.

@@ -236,8 +236,7 @@ def _add_sample(state, model, block, tail, gx, gy, gz, ax, ay, az):  # type: ign
     if (gx + gy + gz + sample[6]) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
         for m in range(SIGNALS):
             anchor[m] = sample[m]
-    for m in range(SUMS):
-        head[m] = 0.0
+    head[:] = 0.0
     _add(tail[at], head, sample, anchor)
     state.moves, state.moves_until, state.samples = False, -1, 0
     for before in range(at - 1, -1, -1):
