@@ -91,8 +91,7 @@ class TomlTable:
 
     def text(self, key: str, default: str | None) -> str | None:
         """Return a text that is not empty; `default` where the key is missing."""
-        value: str | None = self.get(key, default, str)
-        return value
+        return self.get(key, default, str)
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of texts, or the one that stands in its place; empty where the key is missing."""

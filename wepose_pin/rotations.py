@@ -66,12 +66,9 @@ def log(quat: ArrayLike) -> np.ndarray:
     return np.asarray(v * np.divide(angle, sine, out=np.full(sine.shape, 2.0), where=sine > 0.0))
 
 
-def compose(first: Rotation, *others: Rotation) -> Rotation:
-    """``first * others[0] * …``, which SciPy takes thirty times as long for where they are many."""
-    quat = first.as_quat()
-    for other in others:
-        quat = multiply(quat, other.as_quat())
-    return Rotation.from_quat(quat)
+def compose(*factors: Rotation) -> Rotation:
+    """``factors[0] * factors[1] * …``, which SciPy takes thirty times as long for where they are many."""
+    return Rotation.from_quat(reduce(multiply, (each.as_quat() for each in factors)))
 
 
 def turn_about(axes: str, angles: np.ndarray) -> Rotation:

@@ -54,11 +54,8 @@ OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, 
 STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
 
 
-_Records = tuple[np.ndarray, ...]
-
-
 def _run(
-    filter_: OrientationFilter, records: tuple[_Records, _Records], samples: Sequence[np.ndarray], out: Orientation
+    filter_: OrientationFilter, records: Sequence[Sequence[np.ndarray]], samples: Sequence[np.ndarray], out: Orientation
 ) -> None:
     """Fill `out` by the static test and the filter from `samples` gyro_S, accel_S (n, 3), contiguous."""
     filled = (out.quat_VS, out.gyro_bias, out.attitude_cov, out.about_vertical)[: 4 if filter_.has_covariance else 2]
@@ -104,7 +101,7 @@ class SensorFilters:
         if self._filter is PUBLISHED_SMEKF:
             self._test = replace(self._test, rate_stds=np.inf)
         self.names, self._noises = tuple(noises), dict(noises)
-        self._records: dict[str, tuple[_Records, _Records]] = {}  # of the static test and of the filter
+        self._records: dict[str, Sequence[Sequence[np.ndarray]]] = {}  # of the static test and of the filter
         k = len(self.names)
         self._now = make_orientation(k, TYPICAL, covariance=self._filter.has_covariance)
         self._rows = [self._now.take(slice(i, i + 1)) for i in range(k)]  # of each sensor
