@@ -72,6 +72,17 @@ def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tupl
     assert again[1, 1] > before[1, 1]
 
 
+def test_known_mounts_are_not_taken_for_those_of_a_start_pose_in_which_the_arms_are_turned() -> None:
+    person, sizes = simulate_person(13), replace(wp.IDEAL_PRESET, start_pose=1.0)
+    made = simulate(person.lengths, seed=13, imperfections=sizes, noise=wp.NOISE_FREE, clasp_s=30.0, circles=0)
+    rows = [row for name in made.quat_LS for row in mount_rows(name)]
+    covariance = block_diag(person.prior.covariance, np.deg2rad(0.5) ** 2 * np.eye(len(rows)))
+    prior = replace(person.prior, mounts=made.quat_LS, order=(*person.prior.order, *rows), covariance=covariance)
+    calibration = calibrate(made.recording(), measured=person.measured, prior=prior)
+    assert calibration.quality.quality == "pass"
+    assert max(abs(found - person.lengths[name]) for name, found in calibration.subject.lengths.items()) < 0.015
+
+
 def test_all_mounts_share_the_heading_of_a_start_pose_in_which_the_arms_are_raised() -> None:
     """The torso faces forwards to within its soft tissue: about the vertical, which is across an arm in the T-pose."""
     person = simulate_person(11)

@@ -156,7 +156,7 @@ def compute_start_heading_var(
 ) -> float:
     """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset; 0: it defines x."""
     # A calibrated mount contains the heading error of its start pose; what differs between two of them is left.
-    is_calibrated = find_mount_covariance(recording, segment, subject) is not None
+    is_calibrated = subject is not None and segment in subject.start_pose_offset and not recording.remounted
     is_reference = segment == start_pose.table.reference
     return 0.0 if is_reference else float(start_pose.std(segment, again=is_calibrated)[2] ** 2)
 

@@ -16,6 +16,7 @@ from ..body.mounts import (
     MEASURED_ORIENTATION_STD,
     MOUNT_WARNING_DEG,
     compute_heading_offset,
+    compute_start_heading_var,
     find_mount_covariance,
     find_nominal_mount,
 )
@@ -131,7 +132,10 @@ class CalibrationProblem:
         heading = [0.0, 0.0, self.stated_headings[segment]]
         covariance = find_mount_covariance(recording, segment, self.prior)
         if covariance is not None:
-            of_mount = np.linalg.inv(R_start @ covariance @ R_start.T + 1e-12 * np.eye(3))
+            # Headings are relative to the start pose, in which a person turns each segment.
+            turned_var = compute_start_heading_var(recording, segment, self.prior, self.layout.start_pose)
+            covariance = R_start @ covariance @ R_start.T + np.diag([0.0, 0.0, turned_var])
+            of_mount = np.linalg.inv(covariance + 1e-12 * np.eye(3))
         elif segment in recording.imus and (recording.remounted or segment not in self.prior.mounts):
             of_mount = np.diag([0.0, 0.0, STATED_STD**-2])
         else:

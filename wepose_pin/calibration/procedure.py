@@ -415,7 +415,14 @@ def separate_mounts(earlier: Subject, population: Subject) -> Subject:
     at = [earlier.order.index(row) for row in rows]
     covariance = block_diag(population.covariance, earlier.covariance[np.ix_(at, at)])
     order = (*population.order, *rows)
-    return replace(population, name=earlier.name, mounts=earlier.mounts, order=order, covariance=covariance)
+    return replace(
+        population,
+        name=earlier.name,
+        mounts=earlier.mounts,
+        start_pose_offset=earlier.start_pose_offset,
+        order=order,
+        covariance=covariance,
+    )
 
 
 def fuse_calibrations(earlier: Subject, subject: Subject, table: BodyTable) -> Subject:
