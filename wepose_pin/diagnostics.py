@@ -118,9 +118,11 @@ def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
 
 
 def from_json(content: Mapping[str, Any]) -> Diagnostic:
-    """Return the diagnostic of `as_json`; its text is not read."""
-    place, value, limit, facts = (content[name] for name in ("place", "value", "limit", "facts"))
-    return Diagnostic(content["code"], content["severity"], place, value, limit, facts)
+    """Return the diagnostic of `as_json`, whose text is not read; `ValueError`: no such severity."""
+    severity, place, value, limit, facts = (content[name] for name in ("severity", "place", "value", "limit", "facts"))
+    if severity not in (INFO, WARNING, ERROR):
+        raise ValueError(f"severity '{severity}' is not known")
+    return Diagnostic(content["code"], severity, place, value, limit, facts)
 
 
 # Unit → factor from SI, name with the space before it, and least number of significant digits.

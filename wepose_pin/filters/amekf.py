@@ -79,7 +79,7 @@ class AmekfParams(base.FilterParams):
     impact: Positive = 100.0  # [m/s²] beyond it is an impact: the excess, integrated, is a velocity error
     tilt_std: NonNegative = 0.2  # [rad] at the start, which may be in motion
     gyro_matrix_std: NonNegative = 0.002  # each entry of M
-    drift_rate_std: NonNegative = base.DRIFT_RATE_STD  # [rad/s]
+    drift_rate_std: NonNegative = base.DRIFT_RATE_STD  # [rad/s] of the heading in motion, apart from the bias
     gyro_bias_walk: NonNegative = 5e-5  # [rad/s/√s], 100 deg/h in 100 s: it changes with motion too
     static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s]
     accel_bias_std: NonNegative = 0.03  # [m/s²], 3 mg

@@ -37,7 +37,7 @@ class SmekfParams(base.FilterParams):
     static_turn_noise: NonNegative = base.STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical
     gyro_scale_std: NonNegative = 0.002  # of the gyroscope's scale, which no static phase shows
     rate_noise: NonNegative = 2e-3  # [1/√Hz] of gyro in motion, a fraction of |ω|
-    drift_rate_std: NonNegative = base.DRIFT_RATE_STD  # [rad/s]
+    drift_rate_std: NonNegative = base.DRIFT_RATE_STD  # [rad/s] of the heading in motion, apart from the bias
     gyro_range: PositiveOrInfinite = np.inf  # [rad/s] full scale; at it the covariance grows by what may be beyond
 
 

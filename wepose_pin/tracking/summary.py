@@ -237,7 +237,7 @@ class TrackSummary:
             yield Diagnostic("sensors-missing", WARNING, facts=facts)
         for segment, rms in self.residual_rms.items():
             cov = self.tracked.pose.segment_cov.get(segment, np.zeros((1, 3, 3)))
-            limit = max(MOST_RESIDUAL, float(np.sqrt(np.trace(cov, axis1=1, axis2=2).mean())))
+            limit = max(MOST_RESIDUAL, float(np.sqrt(finite_median(np.trace(cov, axis1=1, axis2=2)))))
             if rms > limit:
                 yield Diagnostic("orientation-residual", WARNING, segment, rms, limit)
         for name in self.signals:
